@@ -368,8 +368,11 @@ class Cloud(Particles):
         """Replace all particles by ``contents``."""
         if contents.pool is not None:
             self.set_pool(contents.pool)
-        places, arrays = contents.places_and_arrays(self.kept)
+        places, following, before = self.places.placed(self.kept), contents.next_poses, contents.next_weights
         self._begin_change()
-        self.fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
+        if following is not None and before is not None:
+            places = places._replace(next=places.shown + 1, weight=places.before - 1)
+            self.fill((self.poses[places.next], following), (self.weights[places.before], before))
+        self.fill((self.poses[places.shown], contents.poses), (self.weights[places.weight], contents.weights),
                    (self.states[places.state], contents.state))  # fmt: skip
-        self.set_particles(places, contents.next_count)
+        self.set_particles(places, len(contents.poses if following is None else following))

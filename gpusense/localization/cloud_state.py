@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense.interface import constants as c
-from gpusense.localization.particles import BufferSlots
 from gpusense.reference.weighing import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
@@ -29,22 +28,6 @@ class Contents(NamedTuple):
     next_weights: np.ndarray | None  # (M,) weights at the beginning of the next step; None if ``next_poses`` is None
     state: np.ndarray  # state of the last correction in the kernels' layout
     pool: np.ndarray | None  # poses for recovery to inject, or None
-
-    @property
-    def next_count(self) -> int:
-        """Number of particles of the next step."""
-        return len(self.poses if self.next_poses is None else self.next_poses)
-
-    def places_and_arrays(self, now: BufferSlots) -> tuple[BufferSlots, list[tuple[str, int, np.ndarray]]]:
-        """Return buffers that keep those of ``now`` intact, and the array for each by name and index of the buffer."""
-        places = now.placed(now)
-        if self.next_poses is None or self.next_weights is None:
-            return places, [("poses", places.shown, self.poses), ("weights", places.weight, self.weights)]
-        places = places._replace(next=places.shown + 1, weight=places.before - 1)
-        return places, [
-            ("poses", places.shown, self.poses), ("weights", places.weight, self.weights),
-            ("poses", places.next, self.next_poses), ("weights", places.before, self.next_weights),
-        ]  # fmt: skip
 
 
 class Snapshot:

@@ -127,12 +127,10 @@ class PoseMonitor:
         wrong = self._verdict.wrong
         p_lost, beyond = wrong + (1 - wrong) * share_off(spread), spread_of(spread)
         word = verdict_label(p_lost, wrong, wide=beyond.wide, apart=beyond.apart)
-        margins = margins_of(self._sensors)
-        if covariance is not None:
-            return PoseVerdict(p_lost, word, explained, spread, *margins)
-        return PoseVerdict(
-            p_lost, word, explained, None, *margins, distances_by_scan(self._sensors, readings, place)
-        )  # fmt: skip
+        states_none = covariance is None
+        distances = distances_by_scan(self._sensors, readings, place) if states_none else None
+        stated = None if states_none else spread
+        return PoseVerdict(p_lost, word, explained, stated, *margins_of(self._sensors), distances)
 
     @property
     def state(self) -> VerdictState:

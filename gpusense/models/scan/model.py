@@ -106,9 +106,9 @@ class ScanModel(Pickled):
     @property
     def _last(self) -> LastCall:
         """The last call; a short one is repeated as one of any size, since only those report what they leave out."""
-        call = None if self._short is None else self._short.last
-        if call is not None:
-            request = make_request(self._context, *call.arrays)
+        operands = None if self._short is None else self._short.last
+        if operands is not None:
+            request = make_request(self._context, *operands())
             with self._lock, self._workspace:
                 self._run(request)
                 finish(self._workspace, request.poses.on_device)

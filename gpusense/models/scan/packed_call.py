@@ -11,7 +11,8 @@ from __future__ import annotations
 import functools
 import math
 import threading
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -124,7 +125,7 @@ class PackedCall:
         return True
 
     def shown(self, poses: Any, ranges: Any) -> tuple[Any, Any]:
-        """Return the operands of the last call; arrays of the host are copies, readings in their type."""
+        """Return the operands of the last call: copies of arrays of the host, readings in their type."""
         at, readings = (
             given if slot is None else there if type(slot) is tuple else slot.copy()
             for slot, there, given in zip(self._slots, self._there, (poses, ranges), strict=True)
@@ -139,31 +140,18 @@ class PackedCall:
 # ---- ordinary calls
 
 
-class _Last(NamedTuple):
-    """The last call, with its operands."""
-
-    call: PackedCall
-    poses: Any
-    ranges: Any
-
-    @property
-    def arrays(self) -> tuple[Any, Any]:
-        """The poses and the readings."""
-        return self.call.shown(self.poses, self.ranges)
-
-
 class PackedCallCache:
     """Ordinary calls of a model that repeat a size of few particles, with the same bits as others.
 
     Arrays of the device at addresses that repeat are used in place, others are copied.
 
     Attributes:
-        last: The last call; None if it was not a short one.
+        last: Function that returns poses and readings of the last call; None if it was not a short one.
     """
 
     def __init__(self, pipeline: ScanPipeline) -> None:
         self._pipeline = pipeline
-        self.last: _Last | None = None
+        self.last: Callable[[], tuple[Any, Any]] | None = None
         # Keyed by size and types; and by size, types and addresses of arrays in place.
         self._sizes = RepeatCache[PackedCall](_MOST_SIZES, _BEFORE)
         self._places = RepeatCache[PackedCall](_MOST_PLACES, _BEFORE, _PATIENCE)
@@ -215,7 +203,7 @@ class PackedCallCache:
             self._sizes.clear()
             self._places.clear()
             return None
-        self.last = _Last(call, poses, ranges)
+        self.last = functools.partial(call.shown, poses, ranges)
         if rules.first_scans.left:
             rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
         return result.user_array()

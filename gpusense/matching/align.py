@@ -23,22 +23,13 @@ _MOST, _ITERATIONS, _SMALL = 20_000, 20, 1e-4
 
 def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """Return shares of occupied among known cells near each cell (H, W), 0 where none is known, and of known cells."""
-    offsets = np.arange(-math.ceil(_REACH * sigma), math.ceil(_REACH * sigma) + 1)
-    weights = np.exp(-0.5 * (offsets / sigma) ** 2)
-    weights /= weights.sum()
-    top, bottom = (_convolved(_convolved(image, weights, 0), weights, 1) for image in (occupied & known, known))
+    from scipy.ndimage import gaussian_filter
+
+    top, bottom = (
+        gaussian_filter(image.astype(np.float64), sigma, mode="constant", radius=math.ceil(_REACH * sigma))
+        for image in (occupied & known, known)
+    )
     return np.divide(top, bottom, out=np.zeros_like(top), where=bottom > _KNOWN), bottom
-
-
-def _convolved(image: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
-    """Return weighted sums over cells near each cell along an axis, with zeros beyond the image."""
-    reach = len(weights) // 2
-    padded = np.pad(image.astype(np.float64), [(reach, reach) if k == axis else (0, 0) for k in (0, 1)])
-    total, part = np.zeros(image.shape), np.empty(image.shape)
-    for k, weight in enumerate(weights):
-        shifted = padded[k : k + len(image)] if axis == 0 else padded[:, k : k + image.shape[1]]
-        total += np.multiply(shifted, weight, out=part)
-    return total
 
 
 class Alignment:

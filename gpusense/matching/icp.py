@@ -157,8 +157,6 @@ class PlacedPairs:
         """
         starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)
-        if 0 < len(pairs) <= step:
-            return self._run(pairs, guesses, rules)[:, :, 0, :columns].astype(np.float64)
         result = np.empty((len(pairs), starts, columns))
         for begin in range(0, len(pairs), step):
             part = slice(begin, begin + step)

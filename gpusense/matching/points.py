@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpusense.matching.columns import Column, chosen, column_of, larger, smaller, square_root, values_of
+from gpusense.matching.columns import column_of, larger, square_root, values_of
 from gpusense.reference.pair_steps import noise_of
 from gpusense.world.deskew import sensor_points
 from gpusense.world.grid import OccupancyGrid
@@ -145,7 +145,6 @@ def _points(point: np.ndarray, hit: np.ndarray, gap: float, squares: np.ndarray)
 _PLACES = 120
 # Noise is at least this [m], and rounded up to the next power of this base, so that scans of a call form few groups.
 LEAST_NOISE, LARGEST_NOISE, ROOT = 0.01, 0.08, 2**0.5
-_LOG_OF_ROOT = float(np.log(ROOT))
 # Noise that is assumed where a scan has too few beams for an estimate [m].
 ASSUMED_NOISE = 0.02
 
@@ -205,42 +204,28 @@ def neighbors(scanner: Scanner) -> tuple[tuple[slice, ...], np.ndarray, np.ndarr
         return places, np.sin(after - here) / whole, np.sin(here - before) / whole
 
 
-def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the noise of matches (S,): the larger noise of both scans [m], rounded up to a step; NaN is unknown."""
-    both = column_of(np.fmax(first, second))
-    # NaN differs from itself.
-    both = smaller(larger(chosen(both == both, both, ASSUMED_NOISE), LEAST_NOISE), LARGEST_NOISE)
-    return values_of(LEAST_NOISE * np.power(ROOT, _step_of(both)))
-
-
-def _step_of(noise: Column) -> Column:
-    """Return the powers of the base up to which noise is rounded; noise is from the least to the largest one [m]."""
-    return np.ceil(np.log(noise / LEAST_NOISE) / _LOG_OF_ROOT - 0.1)
-
-
 class NoiseLevels(NamedTuple):
     """The values of the noise of a match."""
 
-    noise: list[float]  # the values, ascending [m]
-    largest: list[float]  # largest noise of scans that is rounded to each of them; larger noise belongs to the last one
+    noise: np.ndarray  # the values, ascending [m]
+    largest: np.ndarray  # largest noise of scans that is rounded to each of them; larger noise belongs to the last one
     assumed: int  # level of a match whose scans have too few beams for an estimate
 
 
 @functools.cache
 def noise_levels() -> NoiseLevels:
-    """Return the values that ``match_noise`` returns."""
-    steps = range(int(_step_of(LARGEST_NOISE)) + 1)
-    noise = [float(LEAST_NOISE * np.power(ROOT, np.float64(step))) for step in steps]
-    return NoiseLevels(noise, [_largest_of(step) for step in steps], int(_step_of(ASSUMED_NOISE)))
+    """Return the values that ``match_noise`` returns, powers of the base; a tenth of a step is rounded down."""
+    steps = range(math.ceil(math.log(LARGEST_NOISE / LEAST_NOISE, ROOT) - 0.1) + 1)
+    noise, largest = (np.array([LEAST_NOISE * ROOT ** (step + more) for step in steps]) for more in (0, 0.1))
+    return NoiseLevels(noise, largest, int(np.searchsorted(largest, ASSUMED_NOISE)))
 
 
-def _largest_of(step: int) -> float:
-    """Return the largest number whose ``_step_of`` is a step."""
-    noise = LEAST_NOISE * ROOT ** (step + 0.1)
-    while _step_of(noise) > step:
-        noise = math.nextafter(noise, 0)
-    while _step_of(math.nextafter(noise, 1)) <= step:
-        noise = math.nextafter(noise, 1)
+def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the noise of matches (S,): the larger noise of both scans [m], rounded up to a step; NaN is unknown."""
+    levels, both = noise_levels(), np.fmax(first, second)
+    both = np.where(np.isnan(both), ASSUMED_NOISE, both)
+    step = np.minimum(np.searchsorted(levels.largest, both), len(levels.noise) - 1)
+    noise: np.ndarray = levels.noise[step]
     return noise
 
 

@@ -41,7 +41,7 @@ class _Scene(NamedTuple):
 
     def levels(self) -> NoiseLevels:
         """Return the levels of noise."""
-        return noise_levels() if self.noise is None else NoiseLevels([self.noise], [math.inf], 0)
+        return noise_levels() if self.noise is None else NoiseLevels(np.array([self.noise]), np.array([math.inf]), 0)
 
 
 def supports_single_pair(backend: Backend, scanner: Scanner) -> bool:
@@ -75,7 +75,7 @@ def match_pair(
         space.download(space.empty("pair summary", 5, _DOUBLE), summary)
         space.read(space.empty("match result", 2 * MATCH_RESULT, real), numbers)
         chosen, one, other, _, squares = summary.tolist()
-        level, gap = scene.levels().noise[int(chosen)], beams_by_angle(scanner, real)[4]
+        level, gap = float(scene.levels().noise[int(chosen)]), beams_by_angle(scanner, real)[4]
         points, noise = np.array([one, other], np.intp), np.array([level])
         device = PlacedPairs(backend, real, space, 2 * scanner.count, points, gap, _PAIR, [level])
         levels = Levels([options.at_noise(level)], [(int(one), int(other))], gap)
@@ -104,7 +104,7 @@ def _program(backend: Backend, space: Workspace, scene: _Scene, options: MatchOp
     strides = max(count // COARSE_POINTS, 1)
     rules = [
         options.at_noise(noise).rules(COARSE_POINTS * stride, gap)
-        for noise in levels.noise
+        for noise in levels.noise.tolist()
         for stride in range(1, strides + 1)
     ]
     buffers: dict[str, Any] = {
@@ -118,7 +118,7 @@ def _program(backend: Backend, space: Workspace, scene: _Scene, options: MatchOp
         "place_pair", with_lanes_flag(lanes, "place_pair", flags), (1,), **buffers,
         reading=space.empty("pair readings", 2 * count, _DOUBLE), work=space.empty("pair work", 4 * room, _DOUBLE),
         beam=backend.upload(np.stack([cosine, sine, bearing, order], axis=1)), weight=backend.upload(weight),
-        level=backend.upload(np.array([levels.largest, [*map(slack_of, levels.noise)]]).T),
+        level=backend.upload(np.array([levels.largest, [*map(slack_of, levels.noise.tolist())]]).T),
         summary=space.empty("pair summary", 5, _DOUBLE), beams=count, places=size, padded=room, step=step,
         nearest=nearest, farthest=farthest, levels=len(levels.noise), assumed=levels.assumed, coarse=COARSE_POINTS,
         strides=strides, **line_rules(WIDTH, gap),

@@ -57,6 +57,10 @@ def cells_of(shape: ScoreTable) -> int:
     return (shape.cols + 2 * shape.margin) * (shape.rows + 2 * shape.margin)
 
 
+def _all_cells(shape: ScoreTable) -> int:
+    return shape.tables * cells_of(shape)
+
+
 def _launched(shape: ScoreTable) -> tuple[int, int, int]:
     """Return the columns, rows and number of tables with their margins."""
     return shape.cols + 2 * shape.margin, shape.rows + 2 * shape.margin, shape.tables
@@ -78,7 +82,7 @@ class ScoreTables:
         self._fine = _STEP[backend.info.kind] - (stack.size > _FEW_CELLS)
         # The margin holds all pooled cells that a table's cells reach, and a run of cells beyond them.
         self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + self.step(levels) - 1 + RUN)
-        cells, info, self._size = self._cells(self.shape), backend.info, _launched(self.shape)
+        cells, info, self._size = _all_cells(self.shape), backend.info, _launched(self.shape)
         if cells > _MOST_CELLS:
             raise ValueError(f"scores: must have at most {_MOST_CELLS} cells with margins, got {stack.shape}")
         # Scores, one table of larger blocks, bounds, and the losses of four blocks at each level.
@@ -93,10 +97,6 @@ class ScoreTables:
         self._levels: list[Buffer] = [backend.upload(padded)]
         self._folded: dict[int, Folded] = {}
         self._quarters: dict[int, Buffer] = {}
-
-    @staticmethod
-    def _cells(shape: ScoreTable) -> int:
-        return math.prod(_launched(shape))
 
     def step(self, level: int) -> int:
         """Return the cells between neighbouring first cells of the folded tables of a level."""
@@ -114,14 +114,14 @@ class ScoreTables:
 
     def _pooled(self, table: Buffer, reach: int) -> Buffer:
         """Return tables of the largest score of each cell and the cells up to ``reach`` further."""
-        made = self.backend.empty(self._cells(self.shape), _BYTE)
+        made = self.backend.empty(_all_cells(self.shape), _BYTE)
         self.backend.compile("pool_scores", _NO_FLAGS)(self._size, table, made, self.shape, reach)
         return made
 
     def quarters(self, level: int) -> Buffer:
         """Return the losses of four blocks of a level, relative to the block that they make, as bytes of numbers."""
         if level not in self._quarters:
-            table, made = self.level(level), self.backend.empty(self._cells(self.shape), _INT)
+            table, made = self.level(level), self.backend.empty(_all_cells(self.shape), _INT)
             self.backend.compile("pack_quarters", _NO_FLAGS)(
                 self._size, table, made, self.shape, self.stride << level
             )  # fmt: skip
@@ -143,22 +143,22 @@ class ScoreTables:
             # A kernel reads no more neighbours of a cell.
             shape = ScoreTable(tables * (period // step) ** 2, *size, RUN if flags else SHIFT_ROWS)
             exact = ScoreTable(tables * period**2, *size, 1)
-            if (most := max(map(self._cells, (shape, exact)))) > _MOST_CELLS:
+            if (most := max(map(_all_cells, (shape, exact)))) > _MOST_CELLS:
                 raise ValueError(f"scores: a search must fold at most {_MOST_CELLS} cells, got {most}")
-            made, quarters = self.backend.empty(self._cells(shape), _BYTE), None
+            made, quarters = self.backend.empty(_all_cells(shape), _BYTE), None
             source = self._pooled(self.level(level), step - 1) if step > 1 else self.level(level)
             self.backend.compile("fold_scores", _NO_FLAGS)(
                 _launched(shape), source, made, self.shape, shape, period, step, self._beyond, unit
             )
             if level:
-                quarters = self.backend.empty(self._cells(exact), _INT)
+                quarters = self.backend.empty(_all_cells(exact), _INT)
                 self.backend.compile("fold_quarters", _NO_FLAGS)(
                     _launched(exact), self.level(level - 1), made, quarters, self.shape, shape, exact, period, step,
                     period // 2, self._beyond, unit,
                 )  # fmt: skip
             table = made
             if not flags:
-                table = self.backend.empty(self._cells(shape), _INT)
+                table = self.backend.empty(_all_cells(shape), _INT)
                 self.backend.compile("pack_rows", _NO_FLAGS)(_launched(shape), made, table, shape)
             # Copies live until the launches have ended.
             self.backend.synchronize()

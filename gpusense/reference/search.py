@@ -131,16 +131,10 @@ def shift_scores(flags, table, point, image, first, allowed, score, scores, item
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 
 
-def _of_lines(score: np.ndarray, count: int, lines: int, length: int, spacing: int, along: int) -> np.ndarray:
-    """Return the scores (items * lines, length) of lines of shifts, see ``line_maxima``."""
-    values = score[: count * length].reshape(-1, lines * length)
-    cells: np.ndarray = values[:, np.arange(lines)[:, None] * spacing + np.arange(length) * along]
-    return cells.reshape(count, length)
-
-
 def line_maxima(flags, score, best, histogram, all, lines, length, spacing, along, turns, shift):
     """Find the largest score of each line of shifts and its first shift, and count the lines of scans by scores."""
-    values = _of_lines(score, all, lines, length, spacing, along)
+    cells = np.arange(lines)[:, None] * spacing + np.arange(length) * along
+    values = score[: all * length].reshape(-1, lines * length)[:, cells].reshape(all, length)
     place, most = values.argmax(axis=1), values.max(axis=1)
     best[: 2 * all : 2], best[1 : 2 * all : 2] = most, np.arange(all) % lines * spacing + place * along
     some = np.flatnonzero(most >= 0)

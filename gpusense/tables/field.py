@@ -136,7 +136,7 @@ class FieldTable:
             return self._peer.terms(self._peer.field_values(squared, p, self._resolution, self._range_max))
         density = FieldDensity(p, self._range_max)
         distance = density.capped(np.sqrt(squared) * self._resolution)
-        return density.log(distance) if self._log_table else distance
+        return density.log(distance) if self._log_table else np.minimum(distance, np.finfo(self._real).max)
 
     def _density_of(self, rows: int, cols: int) -> np.ndarray | None:
         """Return the cell values of the squared distances 0, 1, ... and infinity; None if there are too many.

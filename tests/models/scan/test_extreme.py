@@ -81,3 +81,15 @@ def test_tiny_headings_bearings_and_places(backend, precision):
     # Along the axes, tiny headings have the ranges of heading 0.
     tiny_rows = ranges.reshape(len(places), len(headings), -1)[:, : 2 * (1 + len(TINY)), : len(tiny)]
     assert (tiny_rows[0] == tiny_rows[0, 0, 0]).all()
+
+
+@pytest.mark.parametrize("farthest", [1e30, 1e39, 1e300])
+def test_a_largest_distance_beyond_float32(backend, farthest):
+    poses = np.random.default_rng(0).uniform((-1, -1, -3), (3, 1.5, 3), (100, 3))
+    field = gs.LikelihoodFieldParameters(max_distance=farthest, interpolation="bilinear")
+    grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]] * 6, 0.1), gs.Scanner([0.0, 1.0], 4.0)
+    found, right = (
+        gs.LikelihoodFieldModel(grid, scanner, field, **options).log_likelihood(poses, [1.5, 0.7])
+        for options in ({"backend": backend}, {"backend": "numpy", "precision": "float64"})
+    )
+    np.testing.assert_allclose(found, right, atol=1e-5)

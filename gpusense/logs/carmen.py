@@ -60,7 +60,6 @@ def _records(
     scanners: dict[tuple[float, ...], Scanner] = {}
     range_max = old_range_max = limits[0]
     for where, fields in _messages(path, lines):
-        name = fields[0].decode()
         if fields[0] == b"ODOM":
             values = _message_numbers(where, fields, 6)
             if odometry:
@@ -69,14 +68,13 @@ def _records(
         if fields[0] not in names:
             continue
         geometry: tuple[float, ...]
-        if name.startswith("ROBOT"):
-            config, ranges, poses = _robot_laser(where, fields)
+        config, ranges, poses = _laser(where, fields)
+        if fields[0].startswith(b"ROBOT"):
             start, view, step, stated_max = config[1:5].tolist()
             # Both view and step are rounded to 1e-6.
             finer = view / (ranges.size - 1) if ranges.size > 1 else step
             geometry = start, finer if abs(finer - step) <= 1e-6 else step, ranges.size, range_max or stated_max
         else:
-            ranges, poses = _old_laser(where, fields)
             if old_range_max is None:
                 old_range_max = _range_max_of(path, fields[0])
             geometry = -math.pi / 2, _old_step(ranges.size), ranges.size, old_range_max
@@ -110,22 +108,14 @@ def _messages(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[
         raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, {found}")
 
 
-def _old_laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ranges and the six pose values of FLASER or RLASER."""
-    count = _count(where, fields, 1)
-    values = _message_numbers(where, fields, 1 + count + 6)
-    return values[1 : 1 + count].copy(), values[1 + count :]
-
-
-def _robot_laser(
-    where: str, fields: Sequence[bytes]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the seven configuration values, the ranges and the six pose values of ROBOTLASER."""
-    count = _count(where, fields, 8)
-    remissions = _count(where, fields, 9 + count)
-    values = _message_numbers(where, fields, 8 + count + 1 + remissions + 11)
-    poses = 9 + count + remissions
-    return values[:7], values[8 : 8 + count].copy(), values[poses : poses + 6]
+def _laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64], ...]:
+    """Return the first seven values, which configure a ROBOTLASER, the ranges, and the six pose values of a laser."""
+    robot = fields[0].startswith(b"ROBOT")
+    first = 8 if robot else 1
+    last = first + _count(where, fields, first)
+    poses = last + 1 + _count(where, fields, last + 1) if robot else last
+    values = _message_numbers(where, fields, poses + (11 if robot else 6))
+    return values[:7], values[first:last].copy(), values[poses : poses + 6]
 
 
 def _count(where: str, fields: Sequence[bytes], index: int) -> int:
@@ -179,7 +169,7 @@ def _range_max_of(path: Path, name: bytes) -> float:
     def each(lines: Iterator[tuple[int, bytes]]) -> Iterator[NDArray[np.float64]]:
         for where, fields in _messages(path, lines):
             if fields[0] == name:
-                yield _old_laser(where, fields)[0]
+                yield _laser(where, fields)[1]
 
     for ranges in until_cut(path, each):
         top = float(np.max(ranges, where=np.isfinite(ranges), initial=0.0))

@@ -76,12 +76,4 @@ def _check_sensor(sensor: Any, scans: int, scanners: int) -> Integers:
         if scanners == 1:
             return np.zeros(scans, np.int64)
         raise ValueError(f"sensor: must say which of the {scanners} scanners each scan is of, got None")
-    values = checks.as_array("sensor", sensor)
-    if values.dtype.kind not in "iu" or values.shape != (scans,):
-        rule = f"must have the index of the scanner of each of the {scans} scans"
-        raise ValueError(f"sensor: {rule}, got {values.dtype} of shape {values.shape}")
-    bad = np.flatnonzero((values < 0) | (values >= scanners))
-    if len(bad):
-        raise ValueError(f"sensor: must be in 0 to {scanners - 1}, got {values[bad[0]]} at scan {bad[0]}")
-    index: Integers = values.astype(np.int64)
-    return index
+    return checks.indices("sensor", sensor, scanners, (scans,))

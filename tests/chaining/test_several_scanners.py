@@ -197,8 +197,8 @@ def test_an_interrupt_keeps_the_scans_of_all_lasers_so_far(lap: tuple, needs, mo
     ("changes", "message"),
     [
         ({"sensor": None}, "sensor: must say which of the 2 scanners each scan is of, got None"),
-        ({"sensor": [0, 2]}, "sensor: must be in 0 to 1, got 2 at scan 1"),
-        ({"sensor": [0, -1]}, "sensor: must be in 0 to 1, got -1 at scan 1"),
+        ({"sensor": [0, 2]}, r"sensor: every index must be in \[0, 2\), got 2 at index 1"),
+        ({"sensor": [0, -1]}, r"sensor: every index must be in \[0, 2\), got -1 at index 1"),
         ({"sensor": [0, 0]}, "sensor: every scanner must have a scan, got none of scanner 1"),
         ({"scanner": FRONT}, "sensor: must be None with a single scanner"),
         (

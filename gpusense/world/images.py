@@ -29,8 +29,8 @@ _MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on 
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
 
-# Bytes of a pixel decoded by Pillow, by colour type (grey, palette) and 16 bits or less; other types take 4.
-_PNG_BYTES = {(0, False): 1, (3, False): 1, (0, True): 2}
+# Bytes of a pixel decoded by Pillow, by its mode; other modes take 4.
+_PIXEL_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}
 
 # Shares of red, green and blue in a grey, in thousandths (ITU-R BT.601).
 _LUMA = (299, 587, 114)
@@ -57,12 +57,6 @@ def open_raster(stream: BinaryIO, file: Path, size: int) -> Raster:
     if magic[:2] in (b"P2", b"P3", b"P5", b"P6"):
         return _open_pnm(stream, file, size)
     if magic == b"\x89PNG\r\n\x1a\n":
-        with _decoding(file, "PNG"):
-            header = struct.unpack(">IIBBBBB", stream.read(29)[16:])
-        _check_size(file, header[1], header[0])
-        _check_memory(file, header[1], header[0], _PNG_BYTES.get((header[3], header[2] == 16), 4))
-        with _decoding(file, "PNG"):
-            _check_png(stream, header)
         return _open_pillow(stream, file, size, "PNG")
     if magic[:2] == b"BM":
         return _open_pillow(stream, file, size, "BMP")
@@ -179,12 +173,13 @@ def _decoding(file: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{file}: must be a whole {kind} image, got a broken one: {error}") from error
 
 
-def _check_png(stream: BinaryIO, header: tuple[int, ...]) -> None:
+def _check_png(stream: BinaryIO) -> None:
     """Check, in little memory, that the image data of a PNG inflates to the size in its header.
 
     Pillow allocates by the header and leaves missing pixels black, as if they were walls.
     """
-    cols, rows, depth, colour, _, _, interlace = header
+    stream.seek(16)
+    cols, rows, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", stream.read(13))
     bits = depth * {2: 3, 4: 2, 6: 4}.get(colour, 1)
     # Passes of Adam7: first column, first row, column step, row step.
     adam7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
@@ -271,8 +266,10 @@ def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
         needed = offset + rows * args[1]
         if size < needed:
             raise ValueError(f"{file}: must have at least {needed} bytes, got {size}")
-    _check_memory(file, rows, cols, 1 if image.mode in ("1", "L", "P") else 4)
+    _check_memory(file, rows, cols, _PIXEL_BYTES.get(image.mode, 4))
     with _decoding(file, kind):
+        if kind == "PNG":
+            _check_png(stream)
         image.load()
     return image
 

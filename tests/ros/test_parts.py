@@ -135,6 +135,17 @@ def test_scans_that_differ_by_rounding_or_limits_keep_the_scanner(monkeypatch: p
     np.testing.assert_array_equal(made.calls[-1][1], [math.nan, math.nan, math.inf, 2.0])
 
 
+def test_a_beam_that_repeats_the_first_direction_is_used_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeFilter.made = []
+    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
+    own.set_map(grid())
+    message = scan_of(9)
+    message.angle_increment = 2 * math.pi / 8
+    assert own.update(message, (0.0, 0.0, 0.0), AHEAD)
+    np.testing.assert_array_equal(FakeFilter.made[0].calls[-1][1], [2.0] * 8 + [math.nan])
+
+
 def test_a_scanner_of_as_many_beams_as_places_may_vary(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeFilter.made = []
     monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)

@@ -37,7 +37,6 @@ class Outcome(NamedTuple):
 
     values: dict[str, Any]  # columns of its row by name; empty after a failure
     error: str  # the error in one line; empty after success
-    trace: str = ""  # traceback of the error, for a log
     seconds: float = 0.0  # time of the job [s]
     cpu_seconds: float = 0.0  # processor time of the worker's process during the job [s]
     worker: str = ""  # host and process of the worker
@@ -62,7 +61,7 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
     with _LOCK:
         begin, begin_cpu = time.perf_counter(), time.process_time()
         values: dict[str, Any] = {}
-        error = trace = ""
+        error = ""
         try:
             found = task_of(job)(job, _store(root, chosen, sweep))
             # Python's numbers in place of NumPy's.
@@ -72,9 +71,9 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
             raise
         except BaseException as problem:
             # SystemExit is also an error of the job, and does not end the worker.
-            error, trace = error_text(problem), traceback.format_exc()
+            error = error_text(problem)
         seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
-    return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
+    return Outcome(values, error, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
 
 
 def error_text(error: BaseException) -> str:

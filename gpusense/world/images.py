@@ -169,7 +169,7 @@ def _decoding(file: Path, kind: str) -> Iterator[None]:
     """Convert errors of Pillow, zlib or struct about a broken image to a ValueError."""
     try:
         yield
-    except (OSError, SyntaxError, EOFError, ValueError, struct.error, zlib.error) as error:
+    except (LookupError, OSError, SyntaxError, TypeError, EOFError, ValueError, struct.error, zlib.error) as error:
         raise ValueError(f"{file}: must be a whole {kind} image, got a broken one: {error}") from error
 
 

@@ -1,4 +1,4 @@
-"""Tasks of sweeps that end at once, fail, or end their worker."""
+"""Tasks of sweeps that end at once, fail, or end their worker; runs of sweeps, and waits for processes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,30 @@ import sys
 import threading
 import time
 from pathlib import Path
+
+import gpusense as gs
+
+
+def swept(jobs, path, executor=None, **options):
+    """Run jobs with the NumPy backend; return the summary and the table."""
+    ended = gs.sweep.run(jobs, table=path, executor=executor, backend="numpy", **options)
+    return ended, gs.sweep.read_table(path)
+
+
+def awaited(what, seconds=60):
+    """Wait for a condition."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it has not come"
+        time.sleep(0.02)
+
+
+def alive(process):
+    """Return whether a process runs; zombies do not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def plain(job, store):

@@ -73,7 +73,7 @@ def test_a_bad_plan_is_refused(tmp_path, text, message):
 
 
 def outcome(value, error=""):
-    return Outcome({} if error else {"value": value}, error, "", 0.5, 0.4, "host:1", "numpy")
+    return Outcome({} if error else {"value": value}, error, 0.5, 0.4, "host:1", "numpy")
 
 
 def test_a_table_keeps_all_bits_and_survives_a_torn_line(tmp_path):

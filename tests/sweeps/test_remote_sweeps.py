@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from support.command_line import error_of
 from support.paths import ROOT
-from support.sweep_tasks import sent_text, starts
+from support.sweep_tasks import alive, awaited, sent_text, starts, swept
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -41,7 +41,7 @@ class Cluster:
         self.scheduler = self._start("dask_scheduler", "--port", "0", "--dashboard-address", "127.0.0.1:0",
                                      "--scheduler-file", str(file), *scheduler)  # fmt: skip
         try:
-            self._wait(lambda: file.exists() and file.read_text().endswith("}"))
+            awaited(lambda: self.scheduler.poll() is not None or (file.exists() and file.read_text().endswith("}")))
             self.address = json.loads(file.read_text())["address"]
             for one in workers:
                 self.add(*one)
@@ -60,12 +60,6 @@ class Cluster:
         command += [] if "--host" in arguments else ["--host", "127.0.0.1"]
         quiet = dict(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         return subprocess.Popen(command, env=self._environment, **quiet)
-
-    def _wait(self, ready):
-        end = time.monotonic() + 60
-        while not ready():
-            assert self.scheduler.poll() is None and time.monotonic() < end, "the scheduler has not started"
-            time.sleep(0.05)
 
     def close(self):
         """End all processes; a nanny ends its worker instead of letting it wait for the scheduler."""
@@ -115,32 +109,9 @@ def executor(cluster):
         yield executor
 
 
-def swept(jobs, path, executor=None, **options):
-    ended = gs.sweep.run(jobs, table=path, executor=executor, backend="numpy", **options)
-    return ended, gs.sweep.read_table(path)
-
-
 def made(name, count, folder, **options):
     return [Job(task=f"support.sweep_tasks:{name}", seed=seed, options={"folder": str(folder)} | options)
             for seed in range(count)]  # fmt: skip
-
-
-def awaited(what, seconds=60):
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, "it has not come"
-        time.sleep(0.02)
-
-
-def alive(process):
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def parent(process):
-    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 def test_workers_of_others_supervise_their_jobs(tmp_path, executor):

@@ -7,13 +7,12 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import Executor, Future
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from support.sweep_tasks import start_and_end, starts
+from support.sweep_tasks import alive, awaited, start_and_end, starts, swept
 
 import gpusense as gs
 from gpusense.sweep import Job, ProcessExecutor, SweepLost, WorkerDied
@@ -43,11 +42,6 @@ ERRORS = {
 }
 
 
-def swept(jobs, path, executor=None, **options):
-    ended = gs.sweep.run(jobs, table=path, executor=executor, backend="numpy", **options)
-    return ended, gs.sweep.read_table(path)
-
-
 def endings(folder, ends, count):
     """Return jobs whose first ones have these ends, each between sound jobs."""
     options = {"folder": str(folder)} | {f"end{2 * k}": end for k, end in enumerate(ends)}
@@ -63,21 +57,6 @@ def check(folder, ends, jobs, ended, table, attempts=2):
     assert table["attempts"] == [one[1] if one else 1 for one in expected] == starts(folder, len(jobs))
     assert (ended.done, ended.failed) == (len(jobs) - len(ends), len(ends))
     assert ended.repeated == sum(table["attempts"]) - len(jobs)
-
-
-def alive(process):
-    """Return whether a process runs; zombies do not."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def await_end(processes, seconds=20):
-    end = time.monotonic() + seconds
-    while any(map(alive, processes)):
-        assert time.monotonic() < end, "a process has not ended"
-        time.sleep(0.02)
 
 
 @pytest.mark.sampled(0.5)
@@ -129,18 +108,15 @@ def test_an_interrupt_keeps_what_has_ended_and_ends_what_runs(tmp_path, engine):
 
     def interrupt(row):
         seen.append(row["seed"])
-        end = time.monotonic() + 30
         # Jobs 0 to 3 have ended, and job 4 hangs; the rows of two or more are not yet there.
-        while not (tmp_path / "starts").exists() or starts(tmp_path, 5)[4] == 0:
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        awaited(lambda: (tmp_path / "starts").exists() and starts(tmp_path, 5)[4])
         processes.extend(int(one) for one in running_children())
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), engine(1) as executor:
         swept(jobs, tmp_path / "t.csv", executor, window=5, on_row=lambda row: seen or interrupt(row))
     assert set(range(4)) <= set(gs.sweep.read_table(tmp_path / "t.csv")["seed"]) and len(processes) == 1
-    await_end(processes)
+    awaited(lambda: not any(map(alive, processes)))
 
 
 def running_children():
@@ -160,7 +136,7 @@ def test_what_a_job_has_started_ends_with_its_worker(tmp_path):
         started = executor.submit(start_and_end, str(tmp_path))
         with pytest.raises(WorkerDied, match="with exit code 3"):
             started.result(timeout=60)
-    await_end([int((tmp_path / "process").read_text())])
+    awaited(lambda: not alive(int((tmp_path / "process").read_text())))
 
 
 def test_a_worker_that_ends_between_jobs_is_charged_to_none(tmp_path):
@@ -196,7 +172,7 @@ def test_a_hanging_worker_ends_with_a_parent_that_is_killed(tmp_path):
         parent.stdout.readline()
         parent.kill()
     try:
-        await_end([worker])
+        awaited(lambda: not alive(worker))
     finally:
         if alive(worker):
             os.kill(worker, signal.SIGKILL)

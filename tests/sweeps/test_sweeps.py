@@ -7,6 +7,7 @@ from importlib.util import find_spec
 
 import pytest
 from support.room_log import write_room
+from support.sweep_tasks import swept
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -43,11 +44,6 @@ def cluster():
     pytest.importorskip("distributed")
     with gs.sweep.DaskExecutor(devices=["numpy", "numpy"]) as executor:
         yield executor
-
-
-def swept(jobs, path, executor=None, **options):
-    ended = gs.sweep.run(jobs, table=path, executor=executor, backend="numpy", **options)
-    return ended, gs.sweep.read_table(path)
 
 
 def made(name, count, **options):
@@ -186,7 +182,7 @@ def test_an_executor_that_is_shut_down_is_lost(tmp_path):
     executor.shutdown()
     with pytest.raises(SweepLost, match="must take jobs"):
         swept(made("plain", 1), tmp_path / "t.csv", executor)
-    assert work(made("failing", 2)[1], str(tmp_path), "numpy").trace.startswith("Traceback")
+    assert work(made("failing", 2)[1], str(tmp_path), "numpy").error == "ValueError: a bad seed, 1"
     assert isinstance(SerialExecutor().submit(int, "x").exception(), ValueError)
     for devices in (0, [], "numpy", None):
         with pytest.raises((TypeError, ValueError), match="devices: must be"):

@@ -7,7 +7,7 @@ import gzip
 import numpy as np
 import pytest
 import yaml
-from support.map_files import CELLS, GREYS, pgm, yaml_text
+from support.map_files import CELLS, GREYS, chunk, pgm, png, yaml_text
 
 import gpusense as gs
 from gpusense.world.map_files import read_map
@@ -195,3 +195,14 @@ def test_recorded_maps(data_dir, name, shape, resolution, origin):
 def test_recorded_unknown_depends_on_the_threshold(data_dir):
     assert not read_map(data_dir / "ros_maps" / "depot.yaml").unknown.any()
     assert read_map(data_dir / "ros_maps" / "tb3_sandbox.yaml").unknown.any()
+
+
+@pytest.mark.parametrize(
+    "kind", [b"iCCP", b"tRNS", b"gAMA", b"cHRM", b"pHYs", b"acTL", b"fcTL", b"tEXt", b"iTXt", b"PLTE"]
+)
+def test_empty_chunks_never_raise_anything_else(place, kind):
+    for content in (png(2, 1, b"\0\0\0", before=chunk(kind, b"")), png(2, 1, b"\0\0\0")[:-12] + chunk(kind, b"")):
+        try:
+            read_map(place(content, "map.png"))
+        except ValueError as error:
+            assert "map.png: must be a whole PNG image, got a broken one" in str(error)

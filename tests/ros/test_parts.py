@@ -79,6 +79,16 @@ def grid(wall: int = 0) -> gs.OccupancyGrid:
     return gs.OccupancyGrid(cells, 0.1)
 
 
+@pytest.fixture
+def own(monkeypatch: pytest.MonkeyPatch) -> localizer.Localizer:
+    """Return a localizer on a map whose filters record their calls."""
+    FakeFilter.made = []
+    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
+    own.set_map(grid())
+    return own
+
+
 def test_the_localizer_drives_a_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeFilter.made = []
     monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
@@ -119,11 +129,7 @@ def test_a_scan_that_breaks_a_rule_is_skipped() -> None:
     assert own.update(scan_of(60), (0.0, 0.0, 0.0), np.eye(4)) and own.problem is None
 
 
-def test_scans_that_differ_by_rounding_or_limits_keep_the_scanner(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakeFilter.made = []
-    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
-    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
-    own.set_map(grid())
+def test_scans_that_differ_by_rounding_or_limits_keep_the_scanner(own: localizer.Localizer) -> None:
     assert own.update(scan_of(4), (0.0, 0.0, 0.0), AHEAD)
     message = scan_of(4)
     message.angle_min += 1e-6
@@ -135,22 +141,14 @@ def test_scans_that_differ_by_rounding_or_limits_keep_the_scanner(monkeypatch: p
     np.testing.assert_array_equal(made.calls[-1][1], [math.nan, math.nan, math.inf, 2.0])
 
 
-def test_a_beam_that_repeats_the_first_direction_is_used_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakeFilter.made = []
-    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
-    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
-    own.set_map(grid())
+def test_a_beam_that_repeats_the_first_direction_is_used_once(own: localizer.Localizer) -> None:
     message = scan_of(9)
     message.angle_increment = 2 * math.pi / 8
     assert own.update(message, (0.0, 0.0, 0.0), AHEAD)
     np.testing.assert_array_equal(FakeFilter.made[0].calls[-1][1], [2.0] * 8 + [math.nan])
 
 
-def test_a_scanner_of_as_many_beams_as_places_may_vary(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakeFilter.made = []
-    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
-    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
-    own.set_map(grid())
+def test_a_scanner_of_as_many_beams_as_places_may_vary(own: localizer.Localizer) -> None:
     for k in range(2):
         message = scan_of(localizer.PLACES)
         message.angle_min, message.angle_increment = -1.0 + 0.1 * k, 2.0 / localizer.PLACES

@@ -7,7 +7,7 @@ regimes). If a share a of the wrong places still looks like the right one, an in
 
     log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i).
 
-``docs/background/localization.md`` has all formulas, their reasons, and the runs that the numbers come from.
+``docs/background/localization.md`` lists all formulas, their reasons, and the runs behind the numbers.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A correction that begins a lesson only keeps its scan and estimate. The next one places poses around the estimate while
 the device works on the step, and then starts the terms of the readings there. Another one reads them. In later
 corrections, while the device works on the step, the host fits the scores and learns: one part of the oldest lesson per
-correction, short enough for the wait. Each of the first scans is a lesson, whose parts all run at once. A lesson ends a
-fixed number of corrections later on every device.
+correction, short enough for the wait. Each of the first scans is a lesson, and all its parts run at once. A lesson ends
+a fixed number of corrections later on every device.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Lesson(NamedTuple):
     stage: int = _KEPT
     axes: Any = None  # (3, 3) steps to the poses around the estimate; None before they are placed
     around: Any = None  # (7, 3) these poses
-    columns: Any = None  # places of the evaluated readings, and of those with a constant term
+    columns: Any = None  # columns of the evaluated readings, and of readings with a constant term
     result: Any = None  # terms of the readings as the device writes them, then the taught scan; None of too few beams
 
 

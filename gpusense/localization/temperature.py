@@ -6,12 +6,13 @@ the negative second derivatives, J the variance of the sum of the s_k, and P the
 has J = H (Bartlett's second identity), so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura, "Bayesian composite
 marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite likelihoods" (2012)).
 
-J is measured over blocks of neighbours, whose scores g_b lose B_b B^-1 of the sum of all scores to a fit of the scan: B
-is the sum of s_k s_k', B_b that of a block, which leaves B_b - B_b B^-1 B_b for independent beams. F_n is the ratio of
-the measured variance of n blocks to that. Errors of maps are correlated over any length (aggregated variance: Beran,
-*Statistics for Long-Memory Processes* (1994), section 4.4), so let the inflations of sixteenths, quarters and the whole
-be V, x V and x^2 V. The fit removes the part common to all blocks: F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 =
-(x V - x^2 V / 4) / (1 - 1 / 4). With R = F_4 / F_16, at most 5/3, x is 4 R / (5 - R), and x^2 V = F_4 3 R / (5 - 2 R).
+J is measured over blocks of neighbours with scores g_b. Let B be the sum of s_k s_k', and B_b its part in a block. A
+fit to the scan removes B_b B^-1 of the sum of all scores from g_b, and leaves the variance B_b - B_b B^-1 B_b for
+independent beams. F_n is the measured variance of n blocks relative to this value. Errors of maps are correlated over
+any length (aggregated variance: Beran, *Statistics for Long-Memory Processes* (1994), section 4.4), so let the
+inflations of sixteenths, quarters and the whole be V, x V and x^2 V. The fit removes the part common to all blocks:
+F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V - x^2 V / 4) / (1 - 1 / 4). Let R = F_4 / F_16, at most 5/3. Then
+x is 4 R / (5 - R), and x^2 V = F_4 3 R / (5 - 2 R).
 
 Errors that repeat from scan to scan, with a correlation r in the same direction and a share f of information that the
 filter keeps, have (1 + r f) / (1 - r f) times the variance; the inverse is the second factor of the temperature.

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,8 @@ _UNITS = {
 }  # fmt: skip
 
 
-class FitRow(NamedTuple):
-    """A parameter in the table of a fit: name, value, standard error, and a note."""
-
-    name: str
-    value: Any
-    error: float
-    note: str
+# A row of the table of a fit: name, value, standard error, and a note.
+Row: TypeAlias = tuple[str, Any, float, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +54,9 @@ class Fitted(ABC, Generic[P]):
         """Return all attributes except arrays of readings as plain numbers, lists and strings; None if not finite."""
         return plain_fields(self)
 
-    def _rows(self) -> list[FitRow]:
+    def _rows(self) -> list[Row]:
         return [
-            FitRow(name, value, error, self.held.get(name, ""))
+            (name, value, error, self.held.get(name, ""))
             for name, error in self.standard_errors.items()
             if (value := self._value(name)) is not None
         ]
@@ -79,7 +74,7 @@ class Fitted(ABC, Generic[P]):
         return f"{type(self).__name__}({text}, converged={self.converged})"
 
     def _repr_html_(self) -> str:
-        rows = [(row.name, row.value, _error_text(row.error), row.note) for row in self._rows()]
+        rows = [(name, value, _error_text(error), note) for name, value, error, note in self._rows()]
         return card(f"{type(self).__name__}: {self.status}", rows, head=FIT_HEAD, detail=str(self))
 
     def __str__(self) -> str:
@@ -157,7 +152,7 @@ class BeamFit(Fitted[BeamParameters]):
     def __repr__(self) -> str:
         return self._short(self.parameters.to_dict())
 
-    def _rows(self) -> list[FitRow]:
+    def _rows(self) -> list[Row]:
         return [*super()._rows(), _offset("range_bias", self.range_bias, self.range_bias_error, self.bias_fitted)]
 
     def _counted(self) -> str:
@@ -209,7 +204,7 @@ class LandmarkFit(Fitted[LandmarkParameters]):
     detected: float
     false: Floats = field(repr=False)
 
-    def _rows(self) -> list[FitRow]:
+    def _rows(self) -> list[Row]:
         biases = [
             ("range_bias", self.range_bias, self.range_bias_error),
             ("bearing_bias", self.bearing_bias, self.bearing_bias_error),
@@ -273,9 +268,9 @@ class DiscreteFit(PointFit[Any]):
     max: int
 
 
-def _offset(name: str, value: float, error: float, is_fitted: bool) -> FitRow:
+def _offset(name: str, value: float, error: float, is_fitted: bool) -> Row:
     """Return the row of an offset; the parameters may exclude it."""
-    return FitRow(name, value, error, "fitted" if is_fitted else "estimated, not in the parameters")
+    return name, value, error, "fitted" if is_fitted else "estimated, not in the parameters"
 
 
 def plain_fields(value: Any) -> dict[str, Any]:

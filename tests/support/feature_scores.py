@@ -28,7 +28,6 @@ class Score:
         features: Returned features.
         right: Number of returned features that exist.
         squares: Squared error over covariance, per degree of freedom, of each existing feature.
-        errors: Position error of each existing feature [m]; across the line for lines and hallways.
     """
 
     required: int = 0
@@ -36,7 +35,6 @@ class Score:
     features: int = 0
     right: int = 0
     squares: list[float] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
 
     @property
     def recall(self) -> float:
@@ -65,16 +63,8 @@ def score_scan(features: Features, truth: Truth, scores: dict[str, Score]) -> No
             if error is None:
                 continue
             score.right += 1
-            square = float(error @ mine.information[i] @ error) / FREE[kind]
-            score.squares.append(square)
-            slides = kind in ("line", "hallway")
-            score.errors.append(_across(mine, i, error) if slides else math.hypot(*error[:2]))
+            score.squares.append(float(error @ mine.information[i] @ error) / FREE[kind])
         score.found += sum(_is_found(mine, kind, row) for row in truth.required[kind])
-
-
-def _across(features: Features, i: int, error: np.ndarray) -> float:
-    theta = features.pose[i, 2]
-    return abs(float(-math.sin(theta) * error[0] + math.cos(theta) * error[1]))
 
 
 def _turned(angle: np.ndarray, kind: str) -> np.ndarray:
@@ -138,19 +128,16 @@ class Truth:
     Attributes:
         required: Clearly visible features by kind: rows of a pose (3) and a size.
         allowed: All features by kind; lines have ends x, y, x, y in place of pose and size.
-        runs: (first beam, number of beams, wall) of each run of beams on a wall.
     """
 
     required: dict[str, Floats]
     allowed: dict[str, Floats]
-    runs: list[tuple[int, int, int]] = field(default_factory=list)
 
 
 @dataclass
 class _Run:
     """Successive beams that meet a surface."""
 
-    first: int
     count: int
     surface: int
     points: Floats
@@ -178,7 +165,7 @@ def truth_of(floor: Floor, pose: Floats, bearings: Floats, ranges: Floats, surfa
         "line": local.walls, "corner": local.vertices(), "door": local.doors(), "hallway": local.corridors(),
         "pole": np.column_stack([local.circles[:, :2], np.zeros(len(local.circles)), local.circles[:, 2]]),
     }  # fmt: skip
-    return Truth(required, allowed, [(run.first, run.count, run.surface) for run in walls])
+    return Truth(required, allowed)
 
 
 class _Local:
@@ -236,7 +223,7 @@ def _runs(points: Floats, surface: np.ndarray) -> list[_Run]:
     """Return the runs of beams in the order of beams."""
     edges = np.flatnonzero(np.diff(surface)) + 1
     parts = np.split(np.arange(len(surface)), edges)
-    found = [_Run(int(p[0]), len(p), int(surface[p[0]]), points[p]) for p in parts]
+    found = [_Run(len(p), int(surface[p[0]]), points[p]) for p in parts]
     return [run for run in found if np.isfinite(run.points).all()]
 
 

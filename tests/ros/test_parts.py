@@ -273,19 +273,16 @@ def test_the_watcher_publishes_the_verdict() -> None:
     with pytest.raises(ValueError, match="covariance: must be finite"):
         own.add_pose(pose_message(7.0, truth, deviation=math.nan))
     with pytest.raises(ValueError, match="frame_id: must be 'map', got 'odom'"):
-        own.add_pose(moved_to("odom", 7.0, truth))
-
-
-def moved_to(frame: str, time: float, pose: Any) -> Any:
-    message = pose_message(time, pose)
-    message.header.frame_id = frame
-    return message
+        own.add_pose(stamped(7.0, "odom", pose=pose_message(7.0, truth).pose))
 
 
 def test_the_watcher_reports_the_cause_of_most_poses(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, causes = watcher.Watcher(backend="numpy"), iter(["map", "map", "start", "map", "start", "start", "start"])
+    own, names = watcher.Watcher(backend="numpy"), "map map start map start start start"
+    causes = iter([SimpleNamespace(cause=name, text=name) for name in names.split()])
     verdict = gs.PoseVerdict(0.9, "lost", 0.1)
-    monitor = SimpleNamespace(update=lambda *_: verdict, diagnose=lambda: cause_of(next(causes)))
+    monitor = SimpleNamespace(
+        update=lambda *_: verdict, diagnose=lambda: SimpleNamespace(cause=(name := next(causes)), text=name)
+    )
     monkeypatch.setattr(own, "_monitor_of", lambda *_: monitor)
     own.set_map(grid())
     found = []
@@ -294,10 +291,6 @@ def test_the_watcher_reports_the_cause_of_most_poses(monkeypatch: pytest.MonkeyP
         assert own.add_pose(pose_message(float(k), (1.0, 1.0, 0.0)))
         found.append(own.status(float(k))["values"][-1]["value"])
     assert found == ["map"] * 6 + ["start"]
-
-
-def cause_of(name: str) -> Any:
-    return SimpleNamespace(cause=name, text=name)
 
 
 # ------------------------------------------------------------------------------------------------ starts and scans

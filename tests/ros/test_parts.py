@@ -278,11 +278,8 @@ def test_the_watcher_publishes_the_verdict() -> None:
 
 def test_the_watcher_reports_the_cause_of_most_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     own, names = watcher.Watcher(backend="numpy"), "map map start map start start start"
-    causes = iter([SimpleNamespace(cause=name, text=name) for name in names.split()])
-    verdict = gs.PoseVerdict(0.9, "lost", 0.1)
-    monitor = SimpleNamespace(
-        update=lambda *_: verdict, diagnose=lambda: SimpleNamespace(cause=(name := next(causes)), text=name)
-    )
+    causes = (SimpleNamespace(cause=name, text=name) for name in names.split())
+    monitor = SimpleNamespace(update=lambda *_: gs.PoseVerdict(0.9, "lost", 0.1), diagnose=lambda: next(causes))
     monkeypatch.setattr(own, "_monitor_of", lambda *_: monitor)
     own.set_map(grid())
     found = []

@@ -1,10 +1,17 @@
-"""Constants of kernels that the host needs; the kernel files repeat them."""
+"""Constants that the host shares with kernels.
+
+The loader of OpenCL files defines the constants of a file, listed by ``OF_FILES``; Warp's files and the NumPy reference
+import this module.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+
+from gpusense.interface import feature_layout, formulas
 
 # Kernel file error_free: terms of a block of a compensated sum, and strands that are summed side by side in a block.
 BLOCK_TERMS, STRANDS = 16, 4
@@ -17,6 +24,8 @@ ALL_BINS = BINS**3
 STRETCH = 16
 # Kernel file heading: up to this heading [rad] the counts of quarter turns have 20 bits.
 LARGEST_HEADING = 1048576.0
+# Kernel file rectangles: distance from a changed cell to the farthest cell whose rectangle contains it.
+RECTANGLE_REACH = 254
 # Kernel file scan: max readings are left out, are part of the constant term, or are evaluated like ranges.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
 # Kernel file end_point: cells around a field's window that hold the outside.
@@ -32,14 +41,17 @@ TABLE_POWERS = {4: 5, 8: 8}
 # side and waves that are summed; exp(-NEGLIGIBLE) is below half an eps.
 NEARBY, SERIES, VON_MISES = 0, 1, 2
 WRAPS, WAVES = 3, 6
-NEGLIGIBLE = 40.0
+NEGLIGIBLE = 40
 # Kernel file beacons: distributions of a range; numbers of a beacon: its place (x, its low part, y, its low part), the
 # reading minus the bias with its low part, and the bias.
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
 BEACON = 7
 # Kernel file ray_counts: fraction bits of a coordinate in cells.
 RAY_BITS = 12
-# Kernel file icp: numbers of the result of a match, and of the rules of a level.
+# Kernel file score_cells: columns of a run that a kernel in lanes reads at once, neighbouring rows of shifts that a
+# work-item sums, each of which a table's margin holds; and the largest score of a cell.
+RUN, SHIFT_ROWS, TOP = 32, 8, 255
+# Kernel file icp_match: numbers of the result of a match, and of the rules of a level.
 MATCH_RESULT, MATCH_RULES = 35, 14
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
 GRADIENT_NUMBERS = 13
@@ -91,6 +103,45 @@ ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 11, 8
 MOMENTS, WIDE_HEADINGS, FAR_SHARE = 9, 10, 10
 # Least errors of a pose far off [m, rad].
 FAR, FAR_TURN = 1.0, 0.5
+
+
+_NAMES = {
+    "absolute": "NEARBY SERIES VON_MISES WRAPS WAVES NEGLIGIBLE",
+    "beacons": "STUDENT_T TWO_NORMALS BEACON",
+    "circles": "CIRCLE_NUMBERS",
+    "drawing": """JITTER FARTHEST_X FARTHEST_THETA POOL SCALE STRATIFIED RESIDUAL DRAW_STREAM DRAW_STREAMS LEFT TOTAL
+        RESAMPLED STAGE INJECTED WEIGHT_SUMS""",
+    "end_point": "FIELD_RING",
+    "error_free": "BLOCK_TERMS STRANDS",
+    "estimate": "ESTIMATE_SUMS ESTIMATE_LANES FAR FAR_TURN WIDE_HEADINGS FAR_SHARE",
+    "field_climb": "CLIMB GRADIENT_NUMBERS",
+    "field_gradient": "GRADIENT_NUMBERS",
+    "elementary": "ROUNDER QUARTER HALF_TURN LOG2_HIGH LOG2_LOW INVERSE_LOG2 LEAST_EXPONENT SQRT_HALF EXP ODD",
+    "heading": """LARGEST_HEADING ROUNDER QUARTER QUARTER_LOW TWO_OVER_PI QUARTER_1 QUARTER_2 QUARTER_3 QUARTER_4 S C
+        WORDS""",
+    "icp_match": "MATCH_RESULT MATCH_RULES",
+    "motion": "SEED STEP MEAN DEVIATION REVERSE MOTION_STREAM VELOCITY_MODEL",
+    "order": "BINS ALL_BINS STRETCH",
+    "ray": "TILE_RAYS TILE_PARTICLES TILE",
+    "ray_counts": "RAY_BITS",
+    "rectangles": "RECTANGLE_REACH",
+    "relative": "FARTHEST",
+    "sampling": """READING_STREAM DRAW_TERMS DRAW_SEED DRAW_STEP DRAW_FIRST DRAW_PER_SCAN DRAW_RANGE_MAX DRAW_TOP
+        DRAW_MARGIN HALF_WORD FINE NORMAL_PEAK MOST_HALF FARTHEST_HIT SHORT_SERIES SERIES_END HALF_FROM SERIES_TERMS
+        FRACTION_TERMS CENTRAL CENTRAL_END CENTRAL_OFFSET OUTER_OFFSET OUTERMOST_OFFSET CENTRAL_OVER CENTRAL_UNDER
+        OUTER_OVER OUTER_UNDER OUTERMOST_OVER OUTERMOST_UNDER""",
+    "scan": "MAX_LEFT_OUT MAX_FIXED MAX_PLACED",
+    "score_cells": "RUN SHIFT_ROWS TOP",
+    "segments": "LINE_NUMBERS",
+    "weighing": """SHARE THRESHOLD SCALE PER_BEAM_SCALE SLOW_RATE FAST_RATE MOST_INJECTED TEMPERATURE DEPTH RUNGS LOWEST
+        WEIGHT_SUMS LEFT TOTAL SAMPLE_SIZE RESAMPLED DEGENERATE RUNG STAGE EVIDENCE SLOW FAST INJECTED""",
+}
+_KNOWN: dict[str, Any] = vars(formulas) | globals()
+# Constants of each kernel file, by name: numbers, tuples of coefficients, and lists.
+OF_FILES: dict[str, dict[str, Any]] = {
+    "landmarks": {name: value for name, value in vars(feature_layout).items() if isinstance(value, int)},
+    **{file: {name: _KNOWN[name] for name in names.split()} for file, names in _NAMES.items()},
+}
 
 
 # ---- the numbers of a mixture as kernel arguments: whether densities or logarithms are summed, and rounding

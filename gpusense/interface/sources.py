@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Iterable
+from typing import Any
 
-from gpusense.interface import casters, structs
+from gpusense.interface import casters, constants, structs
 from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
 from gpusense.interface.lanes import takes_scalar_text, written_in_lanes
@@ -169,7 +171,23 @@ def assemble(file: str, flags: frozenset[str]) -> str:
     # Only the kernels of the last file, the program's, are launched.
     kept = {name: text if name == last else _KERNEL.sub(_blank, text) for name, text in texts.items()}
     body = "".join(f'#line 1 "{name}.cl"\n{text}' for name, text in kept.items())
-    return head + _declarations(body) + body
+    return head + _definitions(texts) + _declarations(body) + body
+
+
+def _definitions(files: Iterable[str]) -> str:
+    """Return the constants of kernel files; a file in lanes has the constants of its scalar file."""
+    shared = (constants.OF_FILES.get(file.removeprefix("lanes/"), {}).items() for file in files)
+    return "".join(dict.fromkeys(_definition(name, value) for pairs in shared for name, value in pairs))
+
+
+def _definition(name: str, value: Any) -> str:
+    """Return a number as a macro, a tuple as a macro for each number, or a list as an array."""
+    if isinstance(value, list):
+        kind = "double" if isinstance(value[0], float) else "uint"
+        return f"constant {kind} {name}[{len(value)}] = {{{', '.join(map(str, value))}}};\n"
+    if isinstance(value, tuple):
+        return "".join(f"#define {name}_{i} {number}\n" for i, number in enumerate(value))
+    return f"#define {name} {value}\n"
 
 
 def _blank(match: re.Match[str]) -> str:

@@ -22,8 +22,9 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
+from gpusense.interface.constants import TOP
 from gpusense.matching.pose_grid import Found, PoseGrid
-from gpusense.matching.score_tables import TOP, ScoreTables, quantized
+from gpusense.matching.score_tables import ScoreTables, quantized
 from gpusense.matching.search import Search
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel

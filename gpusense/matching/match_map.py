@@ -16,9 +16,10 @@ from gpusense._util.angles import wrapped
 from gpusense._util.html import card
 from gpusense._util.typing import Floats
 from gpusense.backends import Backend, Selection, get_backend
+from gpusense.interface.constants import TOP
 from gpusense.matching.align import Alignment
 from gpusense.matching.pose_grid import distinct_poses
-from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
+from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import Found, PoseGrid, Search
 from gpusense.tables.distances import distance_transform
 from gpusense.world.grid import OccupancyGrid

@@ -9,17 +9,12 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface.constants import RUN, SHIFT_ROWS, TOP
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.structs import ScoreTable
 
 _BYTE, _INT = np.dtype(np.uint8), np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Columns that a kernel with lanes reads at once; the kernel file ``search`` has the same number.
-RUN = 32
-# Rows of shifts of a work-item, as in the kernel file.
-SHIFT_ROWS = 8
-# Largest score of a cell.
-TOP = 255
 # Levels between the blocks of a level and the steps of their first cells, and scores in a unit of the losses of folded
 # tables, by kind of device: processors add losses of several points in a byte, and need few images in their caches, one
 # level less for tables of more cells.

@@ -16,10 +16,11 @@ import numpy as np
 from gpusense.backends import get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import RUN, SHIFT_ROWS, TOP
 from gpusense.interface.flags import flags_if
 from gpusense.interface.structs import ScoreTable
 from gpusense.matching.pose_grid import Found, PoseGrid
-from gpusense.matching.score_tables import RUN, SHIFT_ROWS, TOP, ScoreTables, cells_of
+from gpusense.matching.score_tables import ScoreTables, cells_of
 
 __all__ = ["Found", "PoseGrid", "Search"]
 

@@ -9,42 +9,25 @@ from __future__ import annotations
 
 import numpy as np
 
-LOG2_HIGH, LOG2_LOW = 0.6931471803691238, 1.9082149292705877e-10
-INVERSE_LOG2 = 1.4426950408889634
-# 1.5 * 2^52: adding it rounds to an integer.
-ROUNDER = 6755399441055744.0
-# Below this exponent the result is 0.
-LEAST_EXPONENT = -700.0
-SQRT_HALF = 0.7071067811865476
-QUARTER, HALF_TURN = 1.5707963267948966, 3.141592653589793
-# 1 / n! for n = 13, ..., 2, and 1 / (2 n + 1) for n = 11, ..., 1.
-EXP = (
-    1.6059043836821613e-10, 2.08767569878681e-09, 2.505210838544172e-08, 2.755731922398589e-07, 2.7557319223985893e-06,
-    2.48015873015873e-05, 0.0001984126984126984, 0.001388888888888889, 0.008333333333333333, 0.041666666666666664,
-    0.16666666666666666, 0.5,
-)  # fmt: skip
-ODD = (
-    0.043478260869565216, 0.047619047619047616, 0.05263157894736842, 0.058823529411764705, 0.06666666666666667,
-    0.07692307692307693, 0.09090909090909091, 0.1111111111111111, 0.14285714285714285, 0.2, 0.3333333333333333,
-)  # fmt: skip
+from gpusense.interface import formulas as f
 
 
 def exp_of(x: np.ndarray) -> np.ndarray:
     """Return ``exp(x)`` for x <= 700; 0 below LEAST_EXPONENT."""
-    held = np.where(x > LEAST_EXPONENT, x, 0.0)
-    count = (held * INVERSE_LOG2 + ROUNDER) - ROUNDER
-    r = (held - count * LOG2_HIGH) - count * LOG2_LOW
-    series = np.full_like(r, EXP[0])
-    for term in EXP[1:]:
+    held = np.where(x > f.LEAST_EXPONENT, x, 0.0)
+    count = (held * f.INVERSE_LOG2 + f.ROUNDER) - f.ROUNDER
+    r = (held - count * f.LOG2_HIGH) - count * f.LOG2_LOW
+    series = np.full_like(r, f.EXP[0])
+    for term in f.EXP[1:]:
         series = series * r + term
     power = ((count.astype(np.int64) + 1023) << 52).view(np.float64)
-    return np.where(x > LEAST_EXPONENT, (1.0 + (r + r * r * series)) * power, 0.0)
+    return np.where(x > f.LEAST_EXPONENT, (1.0 + (r + r * r * series)) * power, 0.0)
 
 
 def odd_series(z: np.ndarray) -> np.ndarray:
     """Return the power series of the logarithm and of the angle."""
-    series = np.full_like(z, ODD[0])
-    for term in ODD[1:]:
+    series = np.full_like(z, f.ODD[0])
+    for term in f.ODD[1:]:
         series = series * z + term
     return series
 
@@ -54,12 +37,12 @@ def log_of(x: np.ndarray) -> np.ndarray:
     bits = np.asarray(x, np.float64).view(np.int64)
     exponent = ((bits >> 52) - 1023).astype(np.float64)
     m = ((bits & 0xFFFFFFFFFFFFF) | 0x3FE0000000000000).view(np.float64)
-    small = m < SQRT_HALF
+    small = m < f.SQRT_HALF
     m = np.where(small, 2.0 * m, m)
     exponent = np.where(small, exponent, exponent + 1.0)
     s = (m - 1.0) / (m + 1.0)
     z = s * s
-    return exponent * LOG2_HIGH + (2.0 * s + (2.0 * s * z * odd_series(z) + exponent * LOG2_LOW))
+    return exponent * f.LOG2_HIGH + (2.0 * s + (2.0 * s * z * odd_series(z) + exponent * f.LOG2_LOW))
 
 
 def angle_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -71,6 +54,6 @@ def angle_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         t = t / (1.0 + np.sqrt(1.0 + t * t))
     z = -(t * t)
     angle = 4.0 * (t + t * z * odd_series(z))
-    angle = np.where(size_y > size_x, QUARTER - angle, angle)
-    angle = np.where(x < 0.0, HALF_TURN - angle, angle)
+    angle = np.where(size_y > size_x, f.QUARTER - angle, angle)
+    angle = np.where(x < 0.0, f.HALF_TURN - angle, angle)
     return np.where(y < 0.0, -angle, angle)

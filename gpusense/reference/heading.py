@@ -10,40 +10,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import formulas as f
 from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.reference.error_free import Pair, pair_product, two_sum
 
-TWO_OVER_PI = 0.6366197723675814
-# 1.5 * 2^52: adding it rounds to an integer.
-ROUNDER = 6755399441055744.0
-# pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
-QUARTER_1, QUARTER_2 = 1.5707963267341256, 6.077100506303966e-11
-QUARTER_3, QUARTER_4 = 2.0222662487111665e-21, 8.4784276603689e-32
-QUARTER, QUARTER_LOW = 1.5707963267948966, 6.123233995736766e-17
-# S and C, lowest power first; their relative errors are 2^-56.4 and 2^-59.6.
-S0, S1, S2 = -0.1666666666666663, 0.008333333333322118, -0.00019841269829589585
-S3, S4, S5 = 2.7557313621399067e-06, -2.505074776451535e-08, 1.5896230233207278e-10
-C0, C1, C2 = 0.041666666666666595, -0.0013888888888873056, 2.4801587288851755e-05
-C3, C4, C5 = -2.7557314179308847e-07, 2.087570084339475e-09, -1.1358536585312173e-11
-# The bits of 2/pi in words of 32 after two words of zeros.
-# fmt: off
-WORDS = np.array([
-    0x00000000, 0x00000000, 0xA2F9836E, 0x4E441529, 0xFC2757D1, 0xF534DDC0, 0xDB629599, 0x3C439041, 0xFE5163AB,
-    0xDEBBC561, 0xB7246E3A, 0x424DD2E0, 0x06492EEA, 0x09D1921C, 0xFE1DEB1C, 0xB129A73E, 0xE88235F5, 0x2EBB4484,
-    0xE99C7026, 0xB45F7E41, 0x3991D639, 0x835339F4, 0x9C845F8B, 0xBDF9283B, 0x1FF897FF, 0xDE05980F, 0xEF2F118B,
-    0x5A0A6D1F, 0x6D367ECF, 0x27CB09B7, 0x4F463F66, 0x9E5FEA2D, 0x7527BAC7, 0xEBE5F17B, 0x3D0739F7, 0x8A5292EA,
-    0x6BFB5FB1, 0x1F8D5D08, 0x56033046,
-], np.uint64)
-# fmt: on
+S0, S1, S2, S3, S4, S5 = f.S
+C0, C1, C2, C3, C4, C5 = f.C
+WORDS = np.array(f.WORDS, np.uint64)
 
 
 def reduce_ordinary(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
     """Reduce headings of at most LARGEST_HEADING to quarter turns modulo 4 and the sum of two numbers."""
-    count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
+    count = (theta * f.TWO_OVER_PI + f.ROUNDER) - f.ROUNDER
     # The first product and difference are exact, and so are the next two products.
-    rest, lost_1 = two_sum(theta - count * QUARTER_1, -(count * QUARTER_2))
-    rest, lost_2 = two_sum(rest, -(count * QUARTER_3))
-    low = (lost_1 + lost_2) - count * QUARTER_4
+    rest, lost_1 = two_sum(theta - count * f.QUARTER_1, -(count * f.QUARTER_2))
+    rest, lost_2 = two_sum(rest, -(count * f.QUARTER_3))
+    low = (lost_1 + lost_2) - count * f.QUARTER_4
     return count.astype(np.int32) & 3, two_sum(rest, low)
 
 
@@ -76,7 +58,7 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
     piece_4 = ((turn_low >> np.uint64(4)) & np.uint64(0x3FFFFFFF)) * 2.0**-122
     total, lost = two_sum(piece_1, piece_2)
     high, low = two_sum(total, lost + (piece_3 + piece_4))
-    high, low = pair_product((high, low), (np.full_like(theta, QUARTER), np.full_like(theta, QUARTER_LOW)))
+    high, low = pair_product((high, low), (np.full_like(theta, f.QUARTER), np.full_like(theta, f.QUARTER_LOW)))
     back = theta < 0
     return np.where(back, -quadrant, quadrant) & 3, (np.where(back, -high, high), np.where(back, -low, low))
 

@@ -7,8 +7,8 @@ is the mass of a component on the measurable interval: [0, range_max], the field
 Components that were not measured are left out. Positions, directions and quantities derived from them are sums of two
 numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm.
 
-A feature is FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its
-low part), and so are an offset and a direction.
+A feature is FEATURE numbers, named in ``interface/feature_layout.py``. A place is (x, its low part, y, its low part),
+and so are an offset and a direction.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Offsets between places, and exponents and logarithms of densities of absolute, radio, contact and landmark sensors.
+"""Offsets between places, and exponents and logarithms of densities of sensors other than scanners.
 
 All are sums of two numbers: a relative error of eps in 20 m is too large for a deviation of 1 cm, and exponent and log
 peak are large and nearly cancel where a density's peak is high. A place is (x, its low part, y, its low part), and so

@@ -3,14 +3,16 @@
 The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one
 step without missing an obstacle; it is the rectangle in which the ray in the middle of the sector stays longest. The
 idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), made of squares. Planes are padded
-by a ring of zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4
-sectors from flat to steep. Planes store rows one after the other, or in groups: a group is stored column by column.
+by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y)
+for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for each. Planes store rows one after the
+other, or in groups: a group is stored column by column, so that vertical neighbours are close in memory.
 
 Planes of several worlds of one size are made together: the runs of row i of world w are line i * worlds + w, and
 place[w] is the world's first cell in tables with a ring of two cells.
 
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
-whose rectangles can contain one of these are computed. The input has a band of rows, from row first on.
+whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a band of
+whole rows of the map, from row first on.
 """
 
 from __future__ import annotations
@@ -19,12 +21,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gpusense.interface.constants import RECTANGLE_REACH
 from gpusense.reference.bits import cells_left, cells_right, unpacked
 
 LONGEST = 255
 # The entry of an occupied cell; ring cells have 0.
 OCCUPIED = 1
-RECTANGLE_REACH = 254
 
 
 def padded(row: np.ndarray, col: np.ndarray, cols: int) -> np.ndarray:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import FARTHEST, LARGEST_HEADING
+from gpusense.interface.formulas import QUARTER, QUARTER_LOW
 from gpusense.reference.error_free import Pair, pair_sum, two_sum, where_pair
-from gpusense.reference.heading import QUARTER, QUARTER_LOW, cos_sin, reduce_huge, reduce_ordinary
+from gpusense.reference.heading import cos_sin, reduce_huge, reduce_ordinary
 
 
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:

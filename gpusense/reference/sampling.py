@@ -21,75 +21,39 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface import constants as c
-from gpusense.reference.elementary import SQRT_HALF, exp_of, log_of
+from gpusense.interface import formulas as f
+from gpusense.reference.elementary import exp_of, log_of
 from gpusense.reference.philox import random_words
 from gpusense.reference.sensor_table import range_bin
 
 BLOCK = 1 << 18
-# 2^20 and 2^-52.
-HALF_WORD, FINE = 1048576.0, 2.220446049250313e-16
-# 1 / sqrt(2 pi); the largest number below one half.
-NORMAL_PEAK, MOST_HALF = 0.3989422804014327, 0.49999999999999994
-# Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
 DRAW_CELLS, DRAW_PER_LOG, DRAW_POWERS = c.TABLE_CELLS[8], c.TABLE_PER_LOG[8], c.TABLE_POWERS[8]
-FARTHEST_HIT = 1e16
-# Change from the series of the mass to the continued fraction; median.
-SERIES_END, SERIES_TERMS, FRACTION_TERMS, HALF_FROM = 4.0, 48, 24, 9.0
-# AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
-CENTRAL, CENTRAL_END, CENTRAL_OFFSET = 0.425, 5.0, 0.180625
-OUTER_OFFSET, OUTERMOST_OFFSET = 1.6, 5.0
-CENTRAL_OVER = (
-    2509.0809287301227, 33430.57558358813, 67265.7709270087, 45921.95393154987, 13731.69376550946, 1971.5909503065513,
-    133.14166789178438, 3.3871328727963665,
-)  # fmt: skip
-CENTRAL_UNDER = (
-    5226.495278852854, 28729.085735721943, 39307.89580009271, 21213.794301586597, 5394.196021424751, 687.1870074920579,
-    42.31333070160091, 1.0,
-)  # fmt: skip
-OUTER_OVER = (
-    0.0007745450142783414, 0.022723844989269184, 0.2417807251774506, 1.2704582524523684, 3.6478483247632045,
-    5.769497221460691, 4.630337846156546, 1.4234371107496835,
-)  # fmt: skip
-OUTER_UNDER = (
-    1.0507500716444169e-09, 0.0005475938084995345, 0.015198666563616457, 0.14810397642748008, 0.6897673349851,
-    1.6763848301838038, 2.053191626637759, 1.0,
-)  # fmt: skip
-OUTERMOST_OVER = (
-    2.0103343992922881e-07, 2.7115555687434876e-05, 0.0012426609473880784, 0.026532189526576124, 0.29656057182850487,
-    1.7848265399172913, 5.463784911164114, 6.657904643501103,
-)  # fmt: skip
-OUTERMOST_UNDER = (
-    2.0442631033899397e-15, 1.421511758316446e-07, 1.8463183175100548e-05, 0.0007868691311456133, 0.014875361290850615,
-    0.1369298809227358, 0.599832206555888, 1.0,
-)  # fmt: skip
-# Below this lambda z* the distribution of p_short is a series.
-SHORT_SERIES = 1e-4
 
 
 def fine_uniform(high: np.ndarray, low: np.ndarray) -> np.ndarray:
     """Return numbers in (0, 1) from two words, the centres of 2^52 intervals."""
-    whole = high.astype(np.float64) * HALF_WORD + (low >> np.uint64(12)).astype(np.float64)
-    return (whole + 0.5) * FINE
+    whole = high.astype(np.float64) * f.HALF_WORD + (low >> np.uint64(12)).astype(np.float64)
+    return (whole + 0.5) * f.FINE
 
 
 def half_mass(x: np.ndarray) -> np.ndarray:
     """Return the mass of the standard normal between 0 and x >= 0."""
-    near = np.minimum(x, SERIES_END)
+    near = np.minimum(x, f.SERIES_END)
     square = near * near
     term, total = np.ones_like(x), np.ones_like(x)
-    for n in range(1, SERIES_TERMS):
+    for n in range(1, f.SERIES_TERMS):
         term = term * (square / (2.0 * n + 1.0))
         total = total + term
-    series = near * (NORMAL_PEAK * exp_of(-0.5 * square)) * total
-    far = np.clip(x, SERIES_END, HALF_FROM)
+    series = near * (f.NORMAL_PEAK * exp_of(-0.5 * square)) * total
+    far = np.clip(x, f.SERIES_END, f.HALF_FROM)
     fraction = far
-    for n in range(FRACTION_TERMS, 0, -1):
+    for n in range(f.FRACTION_TERMS, 0, -1):
         fraction = far + n / fraction
-    tail = NORMAL_PEAK * exp_of(-0.5 * far * far) / fraction
-    return np.where(x < SERIES_END, series, np.where(x < HALF_FROM, 0.5 - tail, 0.5))
+    tail = f.NORMAL_PEAK * exp_of(-0.5 * far * far) / fraction
+    return np.where(x < f.SERIES_END, series, np.where(x < f.HALF_FROM, 0.5 - tail, 0.5))
 
 
-def polynomial(factors: tuple[float, ...], x: np.ndarray) -> np.ndarray:
+def polynomial(factors: list[float], x: np.ndarray) -> np.ndarray:
     """Return a polynomial by Horner's rule, the highest power first."""
     value = np.full_like(x, factors[0])
     for factor in factors[1:]:
@@ -99,21 +63,21 @@ def polynomial(factors: tuple[float, ...], x: np.ndarray) -> np.ndarray:
 
 def half_quantile(mass: np.ndarray) -> np.ndarray:
     """Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF."""
-    r = CENTRAL_OFFSET - mass * mass
-    central = mass * (polynomial(CENTRAL_OVER, r) / polynomial(CENTRAL_UNDER, r))
+    r = f.CENTRAL_OFFSET - mass * mass
+    central = mass * (polynomial(f.CENTRAL_OVER, r) / polynomial(f.CENTRAL_UNDER, r))
     root = np.sqrt(-log_of(0.5 - mass))
-    r = root - OUTER_OFFSET
-    outer = polynomial(OUTER_OVER, r) / polynomial(OUTER_UNDER, r)
-    r = root - OUTERMOST_OFFSET
-    outermost = polynomial(OUTERMOST_OVER, r) / polynomial(OUTERMOST_UNDER, r)
-    return np.where(mass <= CENTRAL, central, np.where(root <= CENTRAL_END, outer, outermost))
+    r = root - f.OUTER_OFFSET
+    outer = polynomial(f.OUTER_OVER, r) / polynomial(f.OUTER_UNDER, r)
+    r = root - f.OUTERMOST_OFFSET
+    outermost = polynomial(f.OUTERMOST_OVER, r) / polynomial(f.OUTERMOST_UNDER, r)
+    return np.where(mass <= f.CENTRAL, central, np.where(root <= f.CENTRAL_END, outer, outermost))
 
 
 def normal_within(u: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return a standard normal deviate between -low <= 0 and high >= 0."""
     below, above = half_mass(low), half_mass(high)
     mark = u * (below + above) - below
-    size = half_quantile(np.minimum(np.abs(mark), MOST_HALF))
+    size = half_quantile(np.minimum(np.abs(mark), f.MOST_HALF))
     return np.minimum(np.maximum(np.where(mark < 0.0, -size, size), -low), high)
 
 
@@ -131,7 +95,7 @@ def tabulated(at: np.ndarray, tables: np.ndarray, place: np.ndarray) -> np.ndarr
 
 def table_mass(u: np.ndarray, tables: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return the mass of a hit between its mean and a distance of u scales, from its table."""
-    at = log_of(1.0 + np.minimum(u, FARTHEST_HIT) * SQRT_HALF)
+    at = log_of(1.0 + np.minimum(u, f.FARTHEST_HIT) * f.SQRT_HALF)
     return np.minimum(tabulated(at, tables, place), 0.5)
 
 
@@ -139,8 +103,8 @@ def table_within(u: np.ndarray, low: np.ndarray, high: np.ndarray, tables: np.nd
     """Return a deviate of a hit between -low <= 0 and high >= 0, from its tables."""
     below, above = table_mass(low, tables, place), table_mass(high, tables, place)
     mark = u * (below + above) - below
-    level = -log_of(1.0 - 2.0 * np.minimum(np.abs(mark), MOST_HALF))
-    size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - 1.0) / SQRT_HALF
+    level = -log_of(1.0 - 2.0 * np.minimum(np.abs(mark), f.MOST_HALF))
+    size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - 1.0) / f.SQRT_HALF
     return np.minimum(np.maximum(np.where(mark < 0.0, -size, size), -low), high)
 
 
@@ -151,7 +115,7 @@ def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarr
     bend = (u / 6.0 - square / 2.0) + square * u / 3.0
     series = expected * (u + x * ((square - u) / 2.0 + x * bend))
     left = (1.0 - u) + u * exp_of(-x)
-    drawn = np.where(x < SHORT_SERIES, series, -log_of(left) / np.where(decay > 0.0, decay, 1.0))
+    drawn = np.where(x < f.SHORT_SERIES, series, -log_of(left) / np.where(decay > 0.0, decay, 1.0))
     return np.minimum(drawn, expected)
 
 

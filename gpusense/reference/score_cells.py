@@ -6,9 +6,6 @@ import numpy as np
 
 from gpusense.interface.structs import ScoreTable
 
-# Largest score of a cell.
-TOP = 255
-
 
 def padded_lines(scores: ScoreTable) -> int:
     """Return the rows of a table with its margin."""

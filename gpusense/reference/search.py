@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface.constants import TOP
 from gpusense.interface.structs import ScoreTable
-from gpusense.reference.score_cells import TOP, cell_index, padded_lines, padded_stride
+from gpusense.reference.score_cells import cell_index, padded_lines, padded_stride
 
 # Sums of a block of candidates.
 _BLOCK = 1 << 22

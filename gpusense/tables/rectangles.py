@@ -13,6 +13,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import RECTANGLE_REACH
 from gpusense.tables.distances import as_bytes, check_size, packed
 from gpusense.tables.world_cells import Stack, Table
 from gpusense.tables.worlds import Worlds
@@ -22,8 +23,7 @@ _INT = np.dtype(np.int32)
 _BYTE = np.dtype(np.uint8)
 _SHORT = np.dtype(np.uint16)
 _NO_FLAGS: frozenset[str] = frozenset()
-# The kernel file ``rectangles`` has the same numbers.
-RECTANGLE_REACH = 254
+# Numbers of a row's stacks; the kernel file ``rectangles`` has the same number.
 _STACK = 1024
 # Least cells of a column that a work-item of a GPU takes, and number of work-items that fill any GPU. Where a column
 # begins, its work-item has to find a rectangle from nothing.

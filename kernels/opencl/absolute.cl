@@ -1,18 +1,6 @@
-// Densities of absolute sensors, which measure a position in the plane or a heading. A position is normal around the
-// truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed by its largest terms up to sigma = 1.5,
-// and for larger sigma by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2). Or a
-// heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and
-// Jupp, Directional Statistics (2000), section 3.5. z_rand is the weight of a uniform density (RAND).
+// Densities of absolute sensors, which measure a position in the plane or a heading; see the reference.
 // requires: error_free log_terms
 
-// Distributions of a heading: sum of normals, its Fourier series, von Mises.
-#define NEARBY 0
-#define SERIES 1
-#define VON_MISES 2
-#define WRAPS 3
-#define WAVES 6
-// exp(-NEGLIGIBLE) is below half an eps.
-#define NEGLIGIBLE 40
 #define HALF_TURN ((real)3.141592653589793)
 #define HALF_TURN_LOW ((real)(FLOAT64 ? 0.0 : -8.742277657347586e-08))
 // sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.

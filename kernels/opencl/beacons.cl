@@ -1,15 +1,6 @@
-// Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one (RAND).
-//     p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
-// d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or a sum of two normals, one of
-// them wide. m is the mass of f on [0, range_max], with d + bias clamped to that interval. For an integer nu the mass
-// of a t between 0 and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
+// Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one; see the reference.
 // requires: error_free log_terms
 
-#define NORMAL 0
-#define STUDENT_T 1
-#define TWO_NORMALS 2
-// A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
-#define BEACON 7
 // From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.
 #define STEEPEST ((real)1e18)
 // From here on the error function is 1 to the last bit.

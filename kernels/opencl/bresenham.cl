@@ -1,11 +1,4 @@
-// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as in nav2_amcl and
-// Beluga. Distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
-// A line midway between two cells steps diagonally, with BELUGA_LINES straight ahead. With AMCL_LINES a line goes on for
-// a cell beyond its end.
-//
-// The table holds the Chebyshev distance to the next occupied cell or to the ring around the grid: a line leaps over
-// that many cells at once. n cells along a line of l cells that ends s cells aside, it is (2 n s + l) / (2 l) cells
-// aside, rounded down; straight ahead (2 n s + l - 1) / (2 l).
+// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end; see the reference.
 // requires: rectangles ray
 
 typedef uchar entry;

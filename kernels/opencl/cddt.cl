@@ -1,9 +1,4 @@
-// Expected range by a compressed directional distance transform (Walsh and Karaman 2018). For each angle bin the map is
-// cut into lines of one cell's width along the bin's direction. Each line has the sorted positions at which obstacles
-// begin. A ray uses the line of its origin in the nearest bin, so errors grow as range * pi / bins. Table of integers:
-// number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from index 1 + 3 bins on, the
-// index of the first obstacle of each line (bins * lines + 1 numbers); then a bit for each cell, set where it is
-// occupied; then the obstacles in 2^-10 cells.
+// Expected range by a compressed directional distance transform (Walsh and Karaman 2018); see the reference.
 // requires: ray
 
 typedef int entry;

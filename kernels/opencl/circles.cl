@@ -1,16 +1,10 @@
-// Circles through parts of scans: poles, and walls that are round.
-//
-// Errors are range errors along beams. Their derivatives grow without bound where a beam grazes the circle, so the
-// cosine of the angle of incidence is at least STEEPEST in them. The bearings of the edges of a pole, between its last
-// beam and the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the
-// sum of squares over centre and radius.
+// Circles through parts of scans: poles, and walls that are round; see the reference.
 
 // Steps of a fit; the first steps, which minimise distances from the circle; the smallest cosine of an angle of
 // incidence.
 #define CIRCLE_STEPS 25
 #define RADIAL_STEPS 8
 #define STEEPEST ((real)0.1)
-#define CIRCLE_NUMBERS 10
 #define WHOLE_TURN ((real)6.283185307179586)
 
 // Points of a part of a scan, its edges, and the deviation of ranges.

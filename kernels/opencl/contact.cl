@@ -1,7 +1,4 @@
-// Probability of contact from the distance of a robot's outline to the nearest obstacle. Each point of the outline
-// falls into a cell of a table of squared distances to the nearest obstacle's centre; the nearest point of a segment
-// counts. An obstacle begins half a cell before its centre. The error of outline and map is normal, so
-//     P(touching) = Phi(-gap / sigma),    P(pressed) = p_contact P(touching) + p_false (1 - P(touching))
+// Probability of contact from the distance of a robot's outline to the nearest obstacle; see the reference.
 // requires: error_free end_point log_terms
 
 #define NO_OBSTACLE 0x7fffffff

@@ -1,28 +1,8 @@
-// Resampling of particles from exact cumulative weights, with jitter between stages and injected poses. Systematic
-// resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: "Probabilistic Robotics" table
-// 4.4, and Kitagawa (1996). Residual resampling copies each particle by the integer part of its expected number of
-// copies, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction a drawn
-// pose moves by a fraction of the difference between two other poses, so that moves scale with the spread of the cloud
-// (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come
-// from a pool: free cells, or the modes of a likelihood map.
+// Resampling of particles from exact cumulative weights, with jitter between stages and injected poses; see the
+// reference.
 // requires: motion
 
-#define JITTER 12
-#define FARTHEST_X 13
-#define FARTHEST_THETA 14
-#define POOL 15
-#define SCALE 21
-#define STRATIFIED 26
-#define RESIDUAL 2.0
-#define LEFT 0
-#define TOTAL 1
-#define RESAMPLED 3
-#define STAGE 8
-#define INJECTED 51
-#define DRAW_STREAM 16
-#define DRAW_STREAMS 4
 #define LEAST_WEIGHT 1e-6
-#define WEIGHT_SUMS 17
 
 // Return the first index whose cumulative weight exceeds a mark.
 int found_at(global const double *ends, const double mark, const int particles) {

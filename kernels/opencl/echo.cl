@@ -1,7 +1,5 @@
-// The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence. The angle of
-// incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring of cells
-// around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine counts as
-// 1.
+// The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence; see the
+// reference.
 // requires: caster mixture shapes
 
 #if CONES

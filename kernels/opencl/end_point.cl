@@ -3,8 +3,6 @@
 // of its rounding errors, is recomputed with twice the digits.
 // requires: error_free
 
-#define FIELD_RING 2
-
 // Clamp i to [0, last]; some drivers call clamp as a function.
 int within(const int i, const int last) { return i < 0 ? 0 : i > last ? last : i; }
 

@@ -65,12 +65,8 @@ int floor_int(const real a) {
 }
 
 // Sums over beams add the terms of a block plainly, then the sum of the block to a compensated total. The accuracy is
-// nearly that of compensating every term, the cost nearly that of compensating none.
-#define BLOCK_TERMS 16
-
-// A block of the beam model's sums has STRANDS strands; strand i has every fourth term from term i on. Each strand is
+// nearly that of compensating every term, the cost nearly that of compensating none. A block of the beam model's sums has STRANDS strands; strand i has every fourth term from term i on. Each strand is
 // added plainly, then its sum to the compensated total. So work-items or lanes that share a block exchange no terms.
-#define STRANDS 4
 
 // Add a term to a compensated sum: total.x is the running sum, total.y the sum of its rounding errors.
 real2 add_term(const real2 total, const real term) {

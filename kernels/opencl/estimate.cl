@@ -1,17 +1,7 @@
-// Weighted mean, circular in the heading, and covariance of a cloud of particles. Sums are relative to the first
-// particle. If no heading is more than a right angle from the first particle's, covariances follow from these sums;
-// otherwise a second pass is relative to the mean. That pass also finds the share of the particles far off the mean.
-// Mardia and Jupp, "Directional Statistics" (2000), section 2.2. In a block, every eighth particle belongs to the same lane; each lane is summed in the order of its particles, and the
-// lanes are then added in order.
+// Weighted mean, circular in the heading, and covariance of a cloud of particles; see the reference.
 // requires: motion
 
-#define ESTIMATE_SUMS 13
-#define ESTIMATE_LANES 8
 #define RIGHT_ANGLE 1.5707963267948966
-#define FAR 1.0
-#define FAR_TURN 0.5
-#define WIDE_HEADINGS 10
-#define FAR_SHARE 10
 
 // Add a particle's weight, offset and turn to the sums; the last sum is of weights beyond a squared distance or a turn.
 void add_pose(const double w, const double x, const double y, const double angle, const double far, const double turn,

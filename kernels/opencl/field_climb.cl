@@ -4,7 +4,6 @@
 
 // Numbers of a climb: the best pose (3), its log-likelihood, gradient (3) and information (6), the pose to start from (2),
 // damping, steps, whether the last step was small, and whether the climb has ended.
-#define CLIMB 19
 #define VALUE 3
 #define SLOPE 4
 #define MATRIX 7
@@ -13,8 +12,6 @@
 #define STEPS 16
 #define CALM 17
 #define ENDED 18
-// Numbers of a pose that field_gradient writes.
-#define GRADIENT_NUMBERS 13
 // Longest and largest step [m, rad], and the farthest that a climb leads from its start [m].
 #define LONGEST 0.5
 #define LARGEST 0.3

@@ -1,10 +1,6 @@
-// Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose. With d the
-// distance of an end point, r its share of the hit density times the weight of its shape (1 for a normal), and J the
-// derivatives of d: d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which
-// leaves out second derivatives of d and of r.
+// Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose; see the
+// reference.
 // requires: field_term
-
-#define GRADIENT_NUMBERS 13
 
 // Return the share of the hit density in the density at a distance.
 real hit_share(const real2 distance, global const FieldTerms *terms) {

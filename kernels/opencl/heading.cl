@@ -1,44 +1,5 @@
-// Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits. A heading is
-// reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the count times
-// pi/2 in four parts (Cody and Waite), for larger headings by an integer product with the relevant bits of 2/pi (Payne
-// and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. bench/derive/heading_constants.py
-// derives the constants.
-
-// Up to this heading the counts of quarter turns have 20 bits.
-#define LARGEST_HEADING 1048576.0
-#define TWO_OVER_PI 0.6366197723675814
-// 1.5 * 2^52: adding it rounds to an integer.
-#define ROUNDER 6755399441055744.0
-// pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
-#define QUARTER_1 1.5707963267341256
-#define QUARTER_2 6.077100506303966e-11
-#define QUARTER_3 2.0222662487111665e-21
-#define QUARTER_4 8.4784276603689e-32
-#define QUARTER 1.5707963267948966
-#define QUARTER_LOW 6.123233995736766e-17
-// S and C, lowest power first; their relative errors are 2^-56.4 and 2^-59.6.
-#define S0 -0.1666666666666663
-#define S1 0.008333333333322118
-#define S2 -0.00019841269829589585
-#define S3 2.7557313621399067e-06
-#define S4 -2.505074776451535e-08
-#define S5 1.5896230233207278e-10
-#define C0 0.041666666666666595
-#define C1 -0.0013888888888873056
-#define C2 2.4801587288851755e-05
-#define C3 -2.7557314179308847e-07
-#define C4 2.087570084339475e-09
-#define C5 -1.1358536585312173e-11
-#if HUGE_HEADINGS
-// The bits of 2/pi in words of 32 after two words of zeros.
-constant uint WORDS[39] = {
-    0x00000000, 0x00000000, 0xA2F9836E, 0x4E441529, 0xFC2757D1, 0xF534DDC0, 0xDB629599, 0x3C439041, 0xFE5163AB,
-    0xDEBBC561, 0xB7246E3A, 0x424DD2E0, 0x06492EEA, 0x09D1921C, 0xFE1DEB1C, 0xB129A73E, 0xE88235F5, 0x2EBB4484,
-    0xE99C7026, 0xB45F7E41, 0x3991D639, 0x835339F4, 0x9C845F8B, 0xBDF9283B, 0x1FF897FF, 0xDE05980F, 0xEF2F118B,
-    0x5A0A6D1F, 0x6D367ECF, 0x27CB09B7, 0x4F463F66, 0x9E5FEA2D, 0x7527BAC7, 0xEBE5F17B, 0x3D0739F7, 0x8A5292EA,
-    0x6BFB5FB1, 0x1F8D5D08, 0x56033046,
-};
-#endif
+// Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits; see the
+// reference.
 
 // Quarter turns modulo 4, and the remaining angle as the sum of two numbers.
 typedef struct {
@@ -125,8 +86,8 @@ double2 cos_sin_of(const Turn turn) {
     const double r = turn.rest.x, low = turn.rest.y;
     const double z = r * r;
     const double half_z = 0.5 * z;
-    const double s = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * S5))));
-    const double c = C0 + z * (C1 + z * (C2 + z * (C3 + z * (C4 + z * C5))));
+    const double s = S_0 + z * (S_1 + z * (S_2 + z * (S_3 + z * (S_4 + z * S_5))));
+    const double c = C_0 + z * (C_1 + z * (C_2 + z * (C_3 + z * (C_4 + z * C_5))));
     const double sine = r + (r * z * s + low * (1.0 - half_z));
     const double near = 1.0 - half_z;
     const double cosine = near + (((1.0 - near) - half_z) + (z * z * c - r * low));

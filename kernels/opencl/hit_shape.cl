@@ -1,8 +1,6 @@
-// Shape of the density of a hit, as a function of the normal's exponent t = u^2 / 2 at a distance of u scales: the
-// density falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t
-// with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight (nu +
-// 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE): each cell
-// of log(1 + b) stores the coefficients of a polynomial in the position within the cell.
+// Shape of the density of a hit, as a function of the normal's exponent t = u^2 / 2 at a distance of u scales; see the
+// reference. The mass between the mean and a distance b comes from a table (MASS_TABLE): each cell of log(1 + b) stores
+// the coefficients of a polynomial in the position within the cell.
 // requires: error_free
 
 #define TABLE_CELLS (FLOAT64 ? 1024 : 256)

@@ -2,13 +2,11 @@
 // scalar or in lanes, stand before this file in a program.
 // requires: icp_step
 
-// Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
+// The MATCH_RESULT numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 // and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
 // that the other scan should see, points through which it saw, points that it did not see, and for blocks of 1, 2, 4 to
 // 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
-#define MATCH_RESULT 35
-// Numbers of the rules of a level.
-#define MATCH_RULES 14
+
 // Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
 #define UNSEEN ((real)0.13)
 

@@ -1,25 +1,5 @@
-// Search for the landmarks near the end point of a feature, book table 6.5. Landmarks are stored in square buckets, row
-// by row; start[i] is the first landmark of bucket i. A search visits the buckets that a disc around the feature's end
-// point touches, and evaluates the landmarks within the disc; landmarks outside have a negligible density.
-//
-// Density of a line of a scan, in normal form, given a line of the map; ends do not count.
-//     p(f | j) = N((alpha, rho); (alpha_j, rho_j), C) / m
-// A line is the points with x cos alpha + y sin alpha = rho: alpha is the direction of its normal, away from the
-// sensor, and rho its distance (Siegwart, Nourbakhsh and Scaramuzza, Introduction to Autonomous Mobile Robots, 2011,
-// section 4.7). alpha_j and rho_j describe the map's line at the particle; alpha - alpha_j is wrapped to (-pi, pi].
-// (alpha, rho) and (alpha + pi, -rho) are one line: where a line of the map is seen from both sides, the normal nearer
-// to the feature's counts. m is the mass of the distance on [0, range_max]. By Cholesky's factor of C the exponent is
-// (a da)^2 + (b da + c dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of
-// the map if its projection overlaps that line: a scan shows only the visible part of a wall. A line of the map has its
-// middle as landmark, its normal away from the free side, and (half length, 1 if it is seen from both sides, 0, 0) as
-// signature.
+// Search for the landmarks near the end point of a feature, book table 6.5; see the reference.
 // requires: error_free landmarks log_terms
-
-// The factor of the angle in the second exponent; places of the ends along the line, from the foot of the normal.
-#define MIXED_SCALE 12
-#define MIXED_SCALE_LOW 13
-#define FIRST_END 17
-#define LAST_END 18
 
 #if LINE
 // Return the normal of a line of the map on the side that faces a feature's sensor.

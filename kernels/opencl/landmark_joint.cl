@@ -1,9 +1,5 @@
-// The likeliest joint association of a few features, in which no two features of one group have the same landmark.
-// Features without a landmark are false positives. Points are all of one group; lines that do not overlap are of
-// different groups, since one wall may be seen in pieces. Landmarks are processed one after the other. A set s of
-// features is a bit mask; best[s] is the largest sum of log p over the features of s when all of them have landmarks
-// that were processed. A landmark can add one feature of each group to a set: 2^features * features steps per landmark
-// and group, and the maximum is exact.
+// The likeliest joint association of a few features, in which no two features of one group have the same landmark; see
+// the reference.
 // requires: error_free landmarks landmark_grid
 
 // Largest number of features.

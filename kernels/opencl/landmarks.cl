@@ -1,56 +1,8 @@
-// Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components.
-//     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
-// d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi].
-// m is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
-// Components that were not measured are left out. Positions, directions and quantities derived from them are sums of
-// two numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm. A feature is
-// FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its low
-// part), and so are an offset and a direction. The sensor's numbers are FeatureTerms of the signature table.
+// Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components; see
+// the reference.
 // requires: error_free log_terms
 
-// Range; cosine and sine of the bearing on the robot; signature.
-#define RANGE_AT 0
-#define RANGE_LOW 1
-#define COSINE 2
-#define SINE 3
-#define COSINE_LOW 4
-#define SINE_LOW 5
-#define SIGNATURE_AT 6
-#define SIGNATURE_LOW 7
-// 1 / (sigma sqrt 2), 0 for components that were not measured; log of z_detect and of the components' peaks; log of the
-// false positive.
-#define RANGE_SCALE 8
-#define RANGE_SCALE_LOW 9
-#define BEARING_SCALE 10
-#define BEARING_SCALE_LOW 11
-#define SIGNATURE_SCALE 12
-#define SIGNATURE_SCALE_LOW 13
-#define PEAK 14
-#define PEAK_LOW 15
-#define FALSE_POSITIVE 16
-// Angle from the bearing to the upper end of the field of view.
-#define UPPER 17
-#define UPPER_LOW 18
-// Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is
-// not negligible; RADIUS is negative where none has.
-#define REACH 19
-#define RADIUS 20
-#define HOLE 21
-// The sensor's limits for components that a feature does not measure: the distance, the cosine of the angle to the
-// axis.
-#define FARTHEST 22
-#define AXIS 23
-// sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
-// density; and the largest error of squared distances.
-#define RANGE_SPREAD 24
-#define BEARING_SPREAD 25
-#define MOST 26
-#define SLACK 27
-// Features of one group have different landmarks in a joint association; features of two groups may share one.
-#define GROUP 28
-#define FEATURE 29
 // Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
-#define ARC_STEPS 8
 // Below this distance [m] all bearings are equally likely.
 #define ZERO_RANGE ((real)1e-6)
 // From here on the error function is 1 to the last bit.

@@ -1,16 +1,5 @@
-// Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
-// Terms are in the log domain, with inverse_sigma and unit_peak. A pair whose reading is NaN is padding. The mean of
-// p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities
-// e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the
-// untruncated density, W = E' the weight of the shape of a hit (1 for a normal), B = -E'' / W^2 (0 for a normal), M the
-// mass between the ends and
-//     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
-//     Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
-// log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
-//     h_s = W u^2 - 1 + T,  h_m = W u + P,
-//     h_ss = W u^2 (B W u^2 - 2) - T + U + T^2,  h_sm = W u (B W u^2 - 2) - P + Q,  h_mm = W (B W u^2 - 1) + V + P^2
-// and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
-//     s_l = 1 - v - lambda z,  s_ll = v (f - 1) - lambda z.
+// Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2);
+// see the reference.
 // requires: mixture error_free
 
 #if INFORMATION

@@ -1,6 +1,4 @@
-// Offsets between places, and exponents and logarithms of densities of absolute, radio, contact and landmark sensors, in
-// sums of two numbers: a relative error of eps in 20 m is too large for a deviation of 1 cm, and exponent and log peak are
-// large and nearly cancel where a density's peak is high. A place is (x, its low part, y, its low part), and so is an offset.
+// Offsets between places, and exponents and logarithms of densities of sensors other than scanners; see the reference.
 // requires: error_free
 
 // Return the offset from a sensor to a landmark or beacon (x, y, and the low parts of both).

@@ -1,7 +1,4 @@
-// Expected range by marching through the distance field (sphere tracing): each step is the distance from the current
-// cell's centre to the nearest obstacle's centre less slack, and at least tolerance. A slack of sqrt(2) lets only steps
-// of length tolerance pass an obstacle: a range is too long by at most tolerance, and an obstacle is missed only where
-// the ray's path through it is shorter than tolerance. With slack 0, as in other programs, any step may pass obstacles.
+// Expected range by marching through the distance field (sphere tracing); see the reference.
 // requires: ray
 
 typedef float entry;

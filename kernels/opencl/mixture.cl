@@ -1,9 +1,5 @@
-// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 failure (max), 4 random
-// measurement (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table. In
-// the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
-// p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). masses are
-// tables of the masses of hits.
+// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom; see the
+// reference. masses are tables of the masses of hits.
 // requires: error_free hit_shape
 
 // From here on the error function is 1 to the last bit.

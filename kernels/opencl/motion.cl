@@ -1,17 +1,7 @@
-// Sampled motions of particles: a first turn, a translation ahead and to the left, and a second turn.
-// Odometry model: Thrun, Burgard and Fox, "Probabilistic Robotics" (2005), table 5.6; velocity model: table 5.3. Each
-// of the four parts is normal, with a mean and a deviation in the settings. An arc of the velocity model
-// (VELOCITY_MODEL) turns by twice the first part; its chord is the arc's length times sin(a) / a. With probability
-// REVERSE the translation goes the other direction: some odometers count wheel turns without their sign.
+// Sampled motions of particles: a first turn, a translation ahead and to the left, and a second turn; see the
+// reference.
 // requires: philox
 
-#define SEED 0
-#define STEP 2
-#define MEAN 3
-#define DEVIATION 7
-#define REVERSE 11
-#define MOTION_STREAM 0
-#define VELOCITY_MODEL 1
 #define SMALL_ARC 1e-4
 #define WHOLE_TURN 6.283185307179586
 // A full turn more than HALF_TURN, rounded down.

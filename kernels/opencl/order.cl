@@ -2,11 +2,8 @@
 // and have similar lengths, so work-items wait less for each other. The order changes no result.
 // requires: ray
 
-// Sampled particles; bins per axis (rows, columns, headings); and bins per work-item of order_starts.
+// Sampled particles.
 #define SAMPLES 256
-#define BINS 32
-#define ALL_BINS (BINS * BINS * BINS)
-#define STRETCH 16
 // Units of a turn.
 #define TURN ((real)65536)
 

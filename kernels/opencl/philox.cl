@@ -1,6 +1,5 @@
-// Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index.
-// Philox 4x32-10: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (2011). Normal deviates
-// are those of Box and Muller: sqrt(-2 log u) (cos 2 pi v, sin 2 pi v). The counter is (particle, step, stream, 0).
+// Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index; see the
+// reference.
 // requires: elementary heading
 
 #define MULTIPLIER_0 0xD2511F53u

@@ -126,9 +126,6 @@ real expected_range(const real t, const RangeScale scale) {
 // Tiles of work-items for GPUs: a work-group takes a tile of neighbouring particles and rays with similar paths. spread
 // = s gives a tile of particles 2^s groups, each with every 2^s-th tile of rays, so that few particles also fill a
 // device. Particles are in the order of the file order, if it was computed.
-#define TILE_RAYS 4
-#define TILE_PARTICLES 16
-#define TILE (TILE_RAYS * TILE_PARTICLES)
 
 // Return the place of a work-item's particle in the order.
 int tile_place(const int item, const int spread) {

@@ -1,11 +1,7 @@
-// Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2). Start and
-// end of a ray are cells with offsets in units of 1/4096 cell, and the walk from cell to cell compares products of
-// integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
-// where the ray ends at an obstacle, and missed otherwise. A ray through a corner (a tie) steps in x first.
+// Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2); see the
+// reference.
 
-// Fraction bits of a coordinate.
-#define BITS 12
-#define UNIT (1 << BITS)
+#define UNIT (1 << RAY_BITS)
 
 // Return the distance along an axis to the first boundary that a ray crosses.
 int to_boundary(const int inside, const int step) {

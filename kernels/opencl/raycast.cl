@@ -1,6 +1,5 @@
-// Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3). It is an
-// Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it steps
-// in x first.
+// Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3); see the
+// reference.
 // requires: rectangles ray
 
 typedef ushort entry;

@@ -1,25 +1,10 @@
-// Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
-// the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
-// cross the rectangle in one step without missing an obstacle. The ray in the middle of the sector stays longest in the
-// chosen rectangle. The idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), made of
-// squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x, +y),
-// (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for each.
-// Planes store rows one after the other, or in groups: a group is stored column by column, so that vertical neighbours
-// are as close in memory as horizontal neighbours.
-//
-// Planes of several worlds of one size are made together: the runs of row i of world w are line i * worlds + w, and
-// place[w] is the world's first cell in tables with a ring of two cells.
-//
-// Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only
-// cells whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a
-// band of whole rows of the map, from row first on.
+// Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells; see the
+// reference.
 // requires: bits
 
 #define LONGEST 255
 // The entry of an occupied cell; the ring has 0.
 #define OCCUPIED 1
-// Distance from a changed cell to the farthest cell whose rectangle contains it.
-#define RECTANGLE_REACH 254
 // Capacity of the stack of columns that may bound a rectangle.
 #define STACK 256
 

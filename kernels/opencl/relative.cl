@@ -8,9 +8,6 @@ typedef float coordinate;
 typedef double coordinate;
 #endif
 
-// Coordinates are clamped to this; its square is finite in float32.
-#define FARTHEST 1152921504606846976.0
-
 // pair_sum of error_free.cl in float64.
 double2 pair_sum_float64(const double2 a, const double2 b) {
     const double2 sum = two_sum_float64(a.x, b.x);

@@ -1,75 +1,9 @@
-// Readings drawn from the beam model, or from a table of a sensor, given their expected ranges. Thrun, Burgard and Fox,
-// "Probabilistic Robotics" (2005), section 6.3.1: a component is drawn by its weight, and a reading by inverting the
-// component's distribution function. For p_hit it is the normal on both sides of its mean, each with its mass on [0,
-// range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond SERIES_END one
-// half less the continued fraction of Laplace. Quantiles: Wichura, "Algorithm AS 241" (1988). For p_short it is 1 - u
-// (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small. Everything is
-// computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits. Other shapes of hits than the
-// normal (MASS_TABLE) have a table of masses and a table of quantiles: cells of equal width in log(1 + b), b = u / sqrt
-// 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the cell. mixture = (z_hit,
-// z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each bin of angles
-// of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities of the
-// bins of readings.
+// Readings drawn from the beam model, or from a table of a sensor, given their expected ranges; see the reference.
 // requires: philox sensor_table
 
-#define READING_STREAM 1073741824u
-#define DRAW_TERMS 9
-// Numbers of the settings by place; DRAW_SEED takes 2.
-#define DRAW_SEED 0
-#define DRAW_STEP 2
-#define DRAW_FIRST 3
-#define DRAW_PER_SCAN 4
-#define DRAW_RANGE_MAX 5
-#define DRAW_TOP 6
-#define DRAW_MARGIN 7
-// 2^20 and 2^-52.
-#define HALF_WORD 1048576.0
-#define FINE 2.220446049250313e-16
-// 1 / sqrt(2 pi); the largest number below one half.
-#define NORMAL_PEAK 0.3989422804014327
-#define MOST_HALF 0.49999999999999994
-// Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
 #define DRAW_CELLS 1024
 #define DRAW_PER_LOG 27.0
 #define DRAW_POWERS 8
-#define FARTHEST_HIT 1e16
-// Change from the series of the mass to the continued fraction; median.
-#define SERIES_END 4.0
-#define SERIES_TERMS 48
-#define FRACTION_TERMS 24
-#define HALF_FROM 9.0
-// AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
-#define CENTRAL 0.425
-#define CENTRAL_END 5.0
-#define CENTRAL_OFFSET 0.180625
-#define OUTER_OFFSET 1.6
-#define OUTERMOST_OFFSET 5.0
-constant double CENTRAL_OVER[8] = {
-    2509.0809287301227, 33430.57558358813, 67265.7709270087, 45921.95393154987, 13731.69376550946, 1971.5909503065513,
-    133.14166789178438, 3.3871328727963665,
-};
-constant double CENTRAL_UNDER[8] = {
-    5226.495278852854, 28729.085735721943, 39307.89580009271, 21213.794301586597, 5394.196021424751, 687.1870074920579,
-    42.31333070160091, 1.0,
-};
-constant double OUTER_OVER[8] = {
-    0.0007745450142783414, 0.022723844989269184, 0.2417807251774506, 1.2704582524523684, 3.6478483247632045,
-    5.769497221460691, 4.630337846156546, 1.4234371107496835,
-};
-constant double OUTER_UNDER[8] = {
-    1.0507500716444169e-09, 0.0005475938084995345, 0.015198666563616457, 0.14810397642748008, 0.6897673349851,
-    1.6763848301838038, 2.053191626637759, 1.0,
-};
-constant double OUTERMOST_OVER[8] = {
-    2.0103343992922881e-07, 2.7115555687434876e-05, 0.0012426609473880784, 0.026532189526576124, 0.29656057182850487,
-    1.7848265399172913, 5.463784911164114, 6.657904643501103,
-};
-constant double OUTERMOST_UNDER[8] = {
-    2.0442631033899397e-15, 1.421511758316446e-07, 1.8463183175100548e-05, 0.0007868691311456133, 0.014875361290850615,
-    0.1369298809227358, 0.599832206555888, 1.0,
-};
-// Below this lambda z* the distribution of p_short is a series.
-#define SHORT_SERIES 1e-4
 
 // Return numbers in (0, 1) from two words, the centres of 2^52 intervals.
 double fine_uniform(const uint high, const uint low) {

@@ -10,11 +10,6 @@ typedef float measured;
 typedef double measured;
 #endif
 
-// Max readings are left out, part of the constant term, or evaluated like others.
-#define MAX_LEFT_OUT 0
-#define MAX_FIXED 1
-#define MAX_PLACED 2
-
 // Return whether an even choice of informative readings includes this rank: some i * informative / chosen equals it.
 int is_chosen(const int rank, const int informative, const int chosen) {
     if (chosen >= informative) return 1;

@@ -1,13 +1,5 @@
 // Cells of consecutive tables of scores, each with a margin of cells around the map.
 
-// Columns of a run that a kernel in lanes reads at once; the margin holds one run.
-#define RUN 32
-// Neighbouring rows of shifts that a work-item sums; the margin holds as many.
-#define SHIFT_ROWS 8
-
-// Largest score of a cell.
-#define TOP 255
-
 // Return the rows of a table with its margin.
 int padded_lines(const ScoreTable scores) { return scores.rows + 2 * scores.margin; }
 

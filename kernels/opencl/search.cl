@@ -1,14 +1,4 @@
-// Exhaustive search over poses: sums of a table's cells over the end points of a scan. For one heading the end points
-// fall into integer cells, and the cells of all positions on the grid are the same ones, shifted. The score of a position
-// is the sum of the table over the shifted cells (Olson, Real-time correlative scan matching, ICRA 2009). A pooled table
-// holds the largest value of a square of positions, so that its sums are upper bounds of all scores in the square (Hess
-// et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are sums of integers, so a bound is never below
-// a score that it bounds.
-//
-// Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
-// first[item] to first[item + 1] - 1, each of which has the first cell of the table (image) that it reads. A folded table holds every
-// period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest score
-// less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
+// Exhaustive search over poses: sums of a table's cells over the end points of a scan; see the reference.
 // requires: score_cells
 
 // Points after which sums are compared, and points whose losses fit 15 bits.

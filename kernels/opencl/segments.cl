@@ -1,11 +1,5 @@
-// Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
-//
-// On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Squared residuals, weighted by
-// range^2 / sigma, are range residuals in standard deviations; their sum is the cost. A scan is split where two lines
-// lower the cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than
-// penalty more (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost
-// least. Lines are then fitted to ranges by Gauss-Newton steps for maximum likelihood. Rows are added by Givens
-// rotations, which avoid cancellation in costs.
+// Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges; see the
+// reference. Rows are added by Givens rotations, which avoid cancellation in costs.
 
 // Passes of merging and of moving ends; Gauss-Newton steps of a line.
 #define PASSES 2
@@ -16,7 +10,6 @@
 #define PARALLEL ((real)1e-6)
 // Splits whose costs differ by less than this share, which exceeds float32 rounding, are tied: the first counts.
 #define TIED ((real)3e-7)
-#define LINE_NUMBERS 6
 
 // The triangular root of rows that were added, the right-hand side, and the cost.
 typedef struct {

@@ -1,6 +1,4 @@
-// Density of one reading from a table of log p over bins of readings and expected ranges. Row i is a bin of readings;
-// the last row is for max readings (log probabilities). Column j is a bin of expected ranges; the last column is for
-// rays without an obstacle.
+// Density of one reading from a table of log p over bins of readings and expected ranges; see the reference.
 // requires: ray
 
 // Return the bin of a range; the last one, after the cells, is for range_max and more.

@@ -1,38 +1,6 @@
-// Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
-// w_k = v exp(b_k (l - max l)), where v is the previous weight, l the sum over sensors of temperature times log p, and
-// b_k = d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE
-// of the previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, "Annealed
-// importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any
-// order.
-// The depth d is 1. If the last rung leaves too few particles, the host repeats the stage with a smaller d. Recovery:
-// augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
+// Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles;
+// see the reference.
 // requires: elementary
-
-#define SHARE 19
-#define THRESHOLD 20
-#define SCALE 21
-#define PER_BEAM_SCALE 22
-#define SLOW_RATE 23
-#define FAST_RATE 24
-#define MOST_INJECTED 25
-#define TEMPERATURE 27
-#define DEPTH 60
-#define RUNGS 8
-// 2^-(RUNGS - 1).
-#define LOWEST 0.0078125
-#define WEIGHT_SUMS (2 * RUNGS + 1)
-// Places in the state: numbers of a stage, then numbers that outlast it.
-#define LEFT 0
-#define TOTAL 1
-#define SAMPLE_SIZE 2
-#define RESAMPLED 3
-#define DEGENERATE 4
-#define RUNG 5
-#define STAGE 8
-#define EVIDENCE 48
-#define SLOW 49
-#define FAST 50
-#define INJECTED 51
 
 // Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of them.
 double8 eight_at(global const double *values, const int first, const int end, const double missing) {

@@ -1,13 +1,8 @@
-"""Densities of absolute sensors, which measure a position in the plane or a heading.
-
-A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed by its
-largest terms up to sigma = 1.5, and for larger sigma by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with
-q = exp(-sigma^2 / 2). Or a heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa
-sin^2(r / 2). Mardia and Jupp, *Directional Statistics* (2000), section 3.5. z_rand is the weight of a uniform density
-(RAND).
-"""
+"""Densities of absolute sensors, which measure a position in the plane or a heading."""
 
 import warp as wp
+
+from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
 
 from .error_free import pair_product, pair_sum, two_sum
 from .flags import FLOAT64, RAND
@@ -15,9 +10,6 @@ from .log_terms import bounded_square, either, log_one_plus
 from .prelude import kernel
 from .types import real, vec2
 
-# Distributions of a heading: sum of normals, its Fourier series, von Mises.
-NEARBY, SERIES, VON_MISES = wp.constant(0), wp.constant(1), wp.constant(2)
-WRAPS, WAVES = wp.constant(3), wp.constant(6)
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
 SINE = (
     -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,
@@ -27,8 +19,7 @@ SINE = (
 ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
 HALF_TURN = real(3.141592653589793)
 HALF_TURN_LOW = real(0.0 if FLOAT64 else -8.742277657347586e-08)
-# exp(-NEGLIGIBLE) is below half an eps.
-NEGLIGIBLE = real(40.0)
+FAR = real(NEGLIGIBLE)
 S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
 
 
@@ -53,7 +44,7 @@ def log_other_turns(residual: vec2, decay: real):
     others = real(0.0)
     k = int(1)
     # For most headings the other turns add nothing.
-    if decay * rest > NEGLIGIBLE:
+    if decay * rest > FAR:
         k = WRAPS + 1
     while k <= WRAPS:
         turns = real(k)

@@ -2,15 +2,14 @@
 
 import warp as wp
 
+from gpusense.interface.constants import BEACON, STUDENT_T, TWO_NORMALS
+
 from .error_free import add_term, pair_product, pair_sum, two_sum
 from .flags import FLOAT64, RAND
 from .log_terms import bounded_square, distance_pair, either, offset
 from .prelude import kernel
 from .types import BeaconTerms, real, vec2, vec4
 
-STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
-# A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
-BEACON = wp.constant(7)
 ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
 # From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.
 STEEPEST = real(1e18)

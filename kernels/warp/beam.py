@@ -4,9 +4,11 @@ import math
 
 import warp as wp
 
+from gpusense.interface.constants import BLOCK_TERMS, STRANDS, TILE_RAYS
+
 from .caster import ENTRY, cast_ray
 from .echo import incidence_terms, nearest_echo
-from .error_free import BLOCK_TERMS, STRANDS, add_strands
+from .error_free import add_strands
 from .flags import (
     ALL_READINGS,
     CONES,
@@ -26,7 +28,7 @@ from .flags import (
 )
 from .mixture import compat_density, last_range, log_density
 from .prelude import behind, kernel, reader, work_item, writer
-from .ray import TILE_RAYS, expected_range, tile_group, tile_place, tile_ray, tile_step
+from .ray import expected_range, tile_group, tile_place, tile_ray, tile_step
 from .sensor_table import tabulated_density
 from .shapes import nearest_shape, world_begin, world_window
 from .types import Caster, Cone, Crowd, MixtureTables, MixtureTerms, RangeScale, Window, real, vec2, vec4

@@ -1,8 +1,4 @@
-"""Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
-
-These start next to it and diverge. gpusense.localization.beam_consistency describes the classes. Steps are half a cell.
-With IN_TEAMS the work-items of a group share the steps of a walk, of which each takes some neighbours.
-"""
+"""Classes of the beams of a scan at one pose: each beam is walked through the map with two companions."""
 
 import math
 
@@ -16,15 +12,15 @@ from .prelude import kernel, work_item
 from .types import Frame
 
 # Values of unknown cells, and of places off the map, also unknown.
-UNKNOWN, OFF = wp.constant(255), wp.constant(256)
+UNKNOWN, OFF = 255, 256
 # Step of a walk, and farthest start of one, where no map reaches [cells].
-STEP, AFAR, MINUS_AFAR = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e9)), wp.constant(wp.float64(-1e9))
-ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
-TWO = wp.constant(wp.float64(2.0))
-FOREVER = wp.constant(wp.float64(math.inf))
-NOTHING, AGREES = wp.constant(constants.NOTHING), wp.constant(constants.AGREES)
-SHORT, THROUGH = wp.constant(constants.SHORT), wp.constant(constants.THROUGH)
-VANISHED = wp.constant(constants.VANISHED)
+STEP, AFAR, MINUS_AFAR = wp.float64(0.5), wp.float64(1e9), wp.float64(-1e9)
+ZERO, ONE, MINUS_ONE = wp.float64(0.0), wp.float64(1.0), wp.float64(-1.0)
+TWO = wp.float64(2.0)
+FOREVER = wp.float64(math.inf)
+NOTHING, AGREES = constants.NOTHING, constants.AGREES
+SHORT, THROUGH = constants.SHORT, constants.THROUGH
+VANISHED = constants.VANISHED
 MOST_WALKERS, FEWER_WALKERS = 256, 32
 _WALKERS = """
 #if defined(__CUDA_ARCH__)

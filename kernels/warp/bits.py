@@ -1,13 +1,11 @@
-"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit. The unused bits
-of the last word of a row are 0. One read of a word gives 32 cells.
-"""
+"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit."""
 
 import warp as wp
 
 from .prelude import reader
 
-NONE = wp.constant(0x7FFFFFFF)
-ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
+NONE = 0x7FFFFFFF
+ALL_BITS = wp.uint32(0xFFFFFFFF)
 word_at = reader(wp.int32)
 
 

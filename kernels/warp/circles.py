@@ -2,11 +2,13 @@
 
 import warp as wp
 
+from gpusense.interface.constants import CIRCLE_NUMBERS
+
 from .prelude import kernel
 from .types import real, vec4
 
 # Steps of a fit, the first of them by distances from the circle; numbers of a circle.
-CIRCLE_STEPS, RADIAL_STEPS, CIRCLE_NUMBERS = 25, 8, 10
+CIRCLE_STEPS, RADIAL_STEPS = 25, 8
 # Cost, gradient (3) and information (xx, xy, xr, yy, yr, rr) of a circle.
 sums10 = wp.types.vector(length=10, dtype=real)
 vec3 = wp.types.vector(length=3, dtype=real)

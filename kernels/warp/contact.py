@@ -10,8 +10,8 @@ from .log_terms import bounded_square, either
 from .prelude import kernel
 from .types import ContactTerms, real, vec2, vec4
 
-NO_OBSTACLE = wp.constant(0x7FFFFFFF)
-SERIES = wp.constant(12)
+NO_OBSTACLE = 0x7FFFFFFF
+SERIES = 12
 ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
 HIGH_PART = real(4096.0)
 # Gap in cells where there is no obstacle.

@@ -1,6 +1,4 @@
-"""Expected range by the plain walk of Amanatides and Woo (1987), cell by cell. It is exact, with the same bits as the
-exact caster. The table holds 1 for occupied cells in a ring of twos.
-"""
+"""Expected range by the plain walk of Amanatides and Woo (1987), cell by cell."""
 
 import warp as wp
 

@@ -11,8 +11,8 @@ import warp as wp
 from .bits import cells_left, cells_right
 from .prelude import kernel
 
-NO_OBSTACLE = wp.constant(-1)
-UNREACHABLE = wp.constant(0x7FFFFFFF)
+NO_OBSTACLE = -1
+UNREACHABLE = 0x7FFFFFFF
 
 
 @kernel
@@ -84,11 +84,11 @@ def distance_envelope(along, starts, squared, lines, length, line_stride, step):
 
 
 # Larger than all distances. Its square plus the square of a distance fits into 32 unsigned bits.
-FAR = wp.constant(46341)
-BLOCK_BITS = wp.constant(5)
-BLOCK_ROWS = wp.constant(32)
+FAR = 46341
+BLOCK_BITS = 5
+BLOCK_ROWS = 32
 # Rows read between two decisions, so that reads do not wait for each other.
-STEP_ROWS = wp.constant(4)
+STEP_ROWS = 4
 
 
 @kernel

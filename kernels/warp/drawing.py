@@ -1,25 +1,15 @@
-"""Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
-
-Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
-Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle by the integer part of its expected
-number of copies, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction a
-drawn pose moves by a fraction of the difference between two other poses, so that moves scale with the spread of the
-cloud (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come
-from a pool: free cells, or the modes of a likelihood map.
-"""
+"""Resampling of particles from exact cumulative weights, with jitter between stages and injected poses."""
 
 import warp as wp
+
+from gpusense.interface import constants as c
 
 from .motion import wrap_once
 from .philox import random_words, uniform_of
 from .prelude import kernel
 
-SEED, STEP, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = (wp.constant(place) for place in (0, 2, 12, 13, 14, 15))
-SCALE, STRATIFIED, WEIGHT_SUMS = (wp.constant(place) for place in (21, 26, 17))
-LEFT, TOTAL, RESAMPLED, STAGE, INJECTED = (wp.constant(place) for place in (0, 1, 3, 8, 51))
-DRAW_STREAM, DRAW_STREAMS = wp.constant(16), wp.constant(4)
-RESIDUAL, LEAST_WEIGHT = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(1e-6))
-ZERO, ONE, TWO = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(2.0))
+BY_RESIDUALS, LEAST_WEIGHT = wp.float64(c.RESIDUAL), wp.float64(1e-6)
+ZERO, ONE, TWO = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0)
 
 
 @wp.func
@@ -76,8 +66,8 @@ def mark_of(fraction: wp.float64, total: wp.float64):
 @wp.func
 def is_copied(state: wp.array(dtype=wp.float64), stage: wp.int32, particles: wp.int32, drawn: wp.int32):
     """Return whether particles are copied, because no resampling is due."""
-    due = state[stage * STAGE + RESAMPLED] != ZERO or drawn != particles
-    return not due or not (state[stage * STAGE + TOTAL] > ZERO)
+    due = state[stage * c.STAGE + c.RESAMPLED] != ZERO or drawn != particles
+    return not due or not (state[stage * c.STAGE + c.TOTAL] > ZERO)
 
 
 @wp.func
@@ -92,7 +82,7 @@ def copy_particle(
         target[3 * n + axis] = source[3 * copied + axis]
     kept = ONE
     if total > ZERO:
-        kept = wp.max(weight[copied] / (total / (settings[SCALE] * wp.float64(particles))), LEAST_WEIGHT)
+        kept = wp.max(weight[copied] / (total / (settings[c.SCALE] * wp.float64(particles))), LEAST_WEIGHT)
         if weight[copied] == ZERO:
             kept = weight[copied]
     after[n] = kept
@@ -101,9 +91,9 @@ def copy_particle(
 @wp.func
 def words_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32, stream: wp.int32):
     """Return the random words of a draw in a stream of its stage."""
-    of_stage = wp.uint32(DRAW_STREAM + DRAW_STREAMS * stage + stream)
-    step = wp.uint32(settings[STEP])
-    return random_words(index, step, of_stage, wp.uint32(settings[SEED]), wp.uint32(settings[SEED + 1]))
+    of_stage = wp.uint32(c.DRAW_STREAM + c.DRAW_STREAMS * stage + stream)
+    step = wp.uint32(settings[c.STEP])
+    return random_words(index, step, of_stage, wp.uint32(settings[c.SEED]), wp.uint32(settings[c.SEED + 1]))
 
 
 @wp.func
@@ -125,28 +115,28 @@ def draw_particle(
     y = source[3 * chosen + 1]
     theta = source[3 * chosen + 2]
     after[n] = ONE
-    if state[stage * STAGE + LEFT] > ZERO:
-        total = state[stage * STAGE + TOTAL]
+    if state[stage * c.STAGE + c.LEFT] > ZERO:
+        total = state[stage * c.STAGE + c.TOTAL]
         words = words_of(settings, stage, index, 1)
         one = 3 * found_at(ends, mark_of(uniform_of(words[0]), total), particles)
         other = 3 * found_at(ends, mark_of(uniform_of(words[1]), total), particles)
         dx = source[one] - source[other]
         dy = source[one + 1] - source[other + 1]
         turn = wrap_once(source[one + 2] - source[other + 2])
-        far_x = wp.max(wp.abs(dx), wp.abs(dy)) / settings[FARTHEST_X]
-        far = wp.max(wp.max(far_x, wp.abs(turn) / settings[FARTHEST_THETA]), ONE)
-        part = settings[JITTER] / far
+        far_x = wp.max(wp.abs(dx), wp.abs(dy)) / settings[c.FARTHEST_X]
+        far = wp.max(wp.max(far_x, wp.abs(turn) / settings[c.FARTHEST_THETA]), ONE)
+        part = settings[c.JITTER] / far
         x += part * dx
         y += part * dy
         theta = wrap_once(theta + part * turn)
-    if stage == 0 and state[INJECTED] > ZERO and settings[POOL] > ZERO:
+    if stage == 0 and state[c.INJECTED] > ZERO and settings[c.POOL] > ZERO:
         some = words_of(settings, stage, index, 2)
         more = words_of(settings, stage, index, 3)
-        if uniform_of(some[0]) < state[INJECTED]:
-            row = 3 * int(wp.min(wp.floor(uniform_of(some[1]) * settings[POOL]), settings[POOL] - ONE))
-            x = pool[row] + (TWO * uniform_of(more[0]) - ONE) * settings[POOL + 1]
-            y = pool[row + 1] + (TWO * uniform_of(more[1]) - ONE) * settings[POOL + 2]
-            theta = wrap_once(pool[row + 2] + (TWO * uniform_of(more[2]) - ONE) * settings[POOL + 3])
+        if uniform_of(some[0]) < state[c.INJECTED]:
+            row = 3 * int(wp.min(wp.floor(uniform_of(some[1]) * settings[c.POOL]), settings[c.POOL] - ONE))
+            x = pool[row] + (TWO * uniform_of(more[0]) - ONE) * settings[c.POOL + 1]
+            y = pool[row + 1] + (TWO * uniform_of(more[1]) - ONE) * settings[c.POOL + 2]
+            theta = wrap_once(pool[row + 2] + (TWO * uniform_of(more[2]) - ONE) * settings[c.POOL + 3])
     target[3 * n] = x
     target[3 * n + 1] = y
     target[3 * n + 2] = theta
@@ -159,13 +149,13 @@ def count_copies(ends, state, sums, particles, block, blocks, drawn, stage):
     begin = b * block
     if begin >= particles:
         return
-    total = state[stage * STAGE + TOTAL]
+    total = state[stage * c.STAGE + c.TOTAL]
     counted = ZERO + ZERO
     for n in range(begin, wp.min(begin + block, particles)):
         counted += copies_of(ends, total, drawn, n)
-    sums[b * WEIGHT_SUMS] = counted
-    for k in range(1, WEIGHT_SUMS):
-        sums[b * WEIGHT_SUMS + k] = ZERO
+    sums[b * c.WEIGHT_SUMS] = counted
+    for k in range(1, c.WEIGHT_SUMS):
+        sums[b * c.WEIGHT_SUMS + k] = ZERO
 
 
 @kernel
@@ -175,10 +165,10 @@ def set_copies(ends, state, sums, joined, copies, particles, block, blocks, fan,
     begin = b * block
     if begin >= particles:
         return
-    total = state[stage * STAGE + TOTAL]
-    counted = sums[b * WEIGHT_SUMS]
+    total = state[stage * c.STAGE + c.TOTAL]
+    counted = sums[b * c.WEIGHT_SUMS]
     if b >= fan:
-        counted += joined[b / fan * WEIGHT_SUMS]
+        counted += joined[b / fan * c.WEIGHT_SUMS]
     for n in range(begin, wp.min(begin + block, particles)):
         counted += copies_of(ends, total, drawn, n)
         copies[n] = counted
@@ -190,18 +180,18 @@ def draw_particles(source, weight, ends, copies, settings, state, pool, target, 
     n = wp.tid()
     if n >= drawn:
         return
-    total = state[stage * STAGE + TOTAL]
+    total = state[stage * c.STAGE + c.TOTAL]
     if is_copied(state, stage, particles, drawn):
         copy_particle(source, weight, settings, total, target, after, particles, n)
         return
     index = wp.uint32(n)
     at = wp.float64(index)
     first = wp.uint32(0)
-    if settings[STRATIFIED] > ZERO:
+    if settings[c.STRATIFIED] > ZERO:
         first = index
     start = start_of(settings, stage, first)
     chosen = int(0)
-    if settings[STRATIFIED] == RESIDUAL:
+    if settings[c.STRATIFIED] == BY_RESIDUALS:
         if at < copies[particles - 1]:
             chosen = found_at(copies, at, particles)
         else:

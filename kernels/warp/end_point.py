@@ -2,12 +2,12 @@
 
 import warp as wp
 
+from gpusense.interface.constants import FIELD_RING
+
 from .error_free import pair_sum, two_product, two_sum
 from .flags import BILINEAR, EXACT_EXPONENT, FLOAT64, INSIDE, TWO_PART_POINTS
 from .prelude import fused
 from .types import Window, real, vec2, vec4
-
-FIELD_RING = wp.constant(2)
 
 
 @wp.func

@@ -1,7 +1,4 @@
-"""Error-free transformations: a second number holds the rounding error of an operation.
-
-Source: Knuth (two_sum), Dekker and Veltkamp (two_product). They need fuse_fp and fast_math off.
-"""
+"""Error-free transformations: a second number holds the rounding error of an operation."""
 
 import warp as wp
 
@@ -10,11 +7,9 @@ from .prelude import exact_fma, fuses, fuses_on_gpu
 from .types import real, vec2, vec4
 
 # Sums over beams add the terms of a block plainly, then the sum of the block to a compensated total. The accuracy is
-# nearly that of compensating every term, the cost nearly that of compensating none.
-BLOCK_TERMS = wp.constant(16)
-# A block of the beam model's sums has STRANDS strands; strand i has every fourth term from term i on. Each strand is
-# added plainly, then its sum to the compensated total. So work-items or lanes that share a block exchange no terms.
-STRANDS = wp.constant(4)
+# nearly that of compensating every term, the cost nearly that of compensating none. A block of the beam model's sums
+# has STRANDS strands; strand i has every fourth term from term i on. Each strand is added plainly, then its sum to the
+# compensated total. So work-items or lanes that share a block exchange no terms.
 multiply_add = exact_fma(real)
 # Beside fused products the loop that rounds cells takes 1.4 times as long on processors.
 at_once = fuses_on_gpu if ROUNDED_CELLS else fuses

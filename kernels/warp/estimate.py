@@ -1,22 +1,17 @@
-"""Weighted mean, circular in the heading, and covariance of a cloud of particles.
-
-Sums are relative to the first particle. If no heading is more than a right angle from the first particle's, covariances
-follow from these sums; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
-(2000), section 2.2. That pass also finds the share of the particles far off the mean. In a block, every eighth particle
-belongs to the same lane; each lane is summed in the order of its particles, and the lanes are then added in order.
-"""
+"""Weighted mean, circular in the heading, and covariance of a cloud of particles."""
 
 import warp as wp
+
+from gpusense.interface import constants as c
 
 from .elementary import angle_of
 from .heading import cos_sin
 from .motion import wrap_once
 from .prelude import kernel
 
-ESTIMATE_SUMS, ESTIMATE_LANES, WIDE_HEADINGS, FAR_SHARE = (wp.constant(number) for number in (13, 8, 10, 10))
-RIGHT_ANGLE, FAR, FAR_TURN = (wp.constant(wp.float64(number)) for number in (1.5707963267948966, 1.0, 0.5))
-ANY = wp.constant(wp.float64(float("inf")))
-ZERO, ONE, TWO = (wp.constant(wp.float64(number)) for number in (0.0, 1.0, 2.0))
+RIGHT_ANGLE, FAR, FAR_TURN = (wp.float64(number) for number in (1.5707963267948966, c.FAR, c.FAR_TURN))
+ANY = wp.float64(float("inf"))
+ZERO, ONE, TWO = (wp.float64(number) for number in (0.0, 1.0, 2.0))
 totals = wp.types.vector(length=13, dtype=wp.float64)
 
 
@@ -24,7 +19,7 @@ totals = wp.types.vector(length=13, dtype=wp.float64)
 def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pass):
     """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings or far poses."""
     i = wp.tid()
-    each = ESTIMATE_LANES / lanes
+    each = c.ESTIMATE_LANES / lanes
     begin = i / each * block
     first = i % each * lanes
     if begin >= particles:
@@ -43,7 +38,7 @@ def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pas
     total = totals()
     for lane in range(first, first + lanes):
         part = totals()
-        for n in range(begin + lane, wp.min(begin + block, particles), ESTIMATE_LANES):
+        for n in range(begin + lane, wp.min(begin + block, particles), c.ESTIMATE_LANES):
             w = weight[n]
             x = poses[3 * n] - x0
             y = poses[3 * n + 1] - y0
@@ -65,7 +60,7 @@ def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pas
         for k in range(13):
             total[k] += part[k]
     for k in range(13):
-        sums[i * ESTIMATE_SUMS + k] = total[k]
+        sums[i * c.ESTIMATE_SUMS + k] = total[k]
 
 
 @kernel
@@ -77,7 +72,7 @@ def finish_estimate(poses, sums, estimate, groups, second_pass):
     total = totals()
     for g in range(groups):
         for k in range(13):
-            total[k] += sums[g * ESTIMATE_SUMS + k]
+            total[k] += sums[g * c.ESTIMATE_SUMS + k]
     weight = wp.where(total[0] > ZERO, total[0], ONE)
     x = total[1] / weight
     y = total[2] / weight
@@ -89,9 +84,9 @@ def finish_estimate(poses, sums, estimate, groups, second_pass):
         estimate[1] = poses[1] + y
         estimate[2] = wrap_once(poses[2] + mean)
         estimate[9] = weight
-        estimate[WIDE_HEADINGS] = wp.where(total[12] > ZERO or wp.abs(mean) > RIGHT_ANGLE, ONE, ZERO)
+        estimate[c.WIDE_HEADINGS] = wp.where(total[12] > ZERO or wp.abs(mean) > RIGHT_ANGLE, ONE, ZERO)
     if second_pass != 0:
-        estimate[FAR_SHARE] = total[12] / weight
+        estimate[c.FAR_SHARE] = total[12] / weight
     estimate[3] = total[6] / weight - x * x
     estimate[4] = total[7] / weight - x * y
     estimate[5] = total[8] / weight - x * angle

@@ -6,8 +6,10 @@ fewer than 2^31 cells, and a launch fewer than 2^31 parts, so indices fit int32.
 
 import warp as wp
 
+from gpusense.interface.constants import BLOCK_TERMS
+
 from .end_point import end_point, field_cell, rounded_cell, rounding_margin, table_cell, table_origin
-from .error_free import BLOCK_TERMS, add_term
+from .error_free import add_term
 from .field_term import careful_value, quick_value, reading_value
 from .flags import CUBES, IN_LANES, PER_BEAM, ROUNDED_CELLS, SCANS, TWO_PART_POINTS, WORLDS
 from .lanes.field_term import block_exponents, block_logs
@@ -16,11 +18,11 @@ from .shapes import world_begin, world_window
 from .types import FieldTerms, Window, real, vec2, vec4
 
 # Particles per work-group of field_blocks.
-GROUP = wp.constant(64)
+GROUP = 64
 rest_of = behind(real)
 ZERO, HALF = real(0.0), real(0.5)
-# Constants of loops that Warp shall unroll.
-WHOLE_BLOCK, HALF_BLOCK = 16, 8
+# A constant of a loop that Warp shall unroll.
+HALF_BLOCK = BLOCK_TERMS // 2
 number_at, cell_at, point_at, pose_at = reader(real), reader(wp.vec2i), reader(vec2), reader(vec4)
 two_at, term_of = reader(vec2, 2), field_readers(FieldTerms)
 block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
@@ -39,7 +41,7 @@ def rounded_block(
     worst = real(0.0)
     if begin + BLOCK_TERMS <= end:
         if SCANS:
-            for i in range(WHOLE_BLOCK):
+            for i in range(BLOCK_TERMS):
                 value, off = quick_value(table, start_cell, lowered, point_at(point, begin + i), far, window)
                 worst = wp.max(worst, off)
                 total += value

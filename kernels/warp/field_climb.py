@@ -2,27 +2,22 @@
 
 import warp as wp
 
+from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS
+
 from .placement import place_pose
 from .prelude import kernel
 
 # Numbers of a climb: the best pose (3), its log-likelihood, gradient (3) and information (6), the pose to start from
 # (2), damping, steps, whether the last step was small, and whether the climb has ended.
-CLIMB = wp.constant(19)
-VALUE, SLOPE, MATRIX, START = wp.constant(3), wp.constant(4), wp.constant(7), wp.constant(13)
-DAMPING, STEPS, CALM, ENDED = wp.constant(15), wp.constant(16), wp.constant(17), wp.constant(18)
-# Numbers of a pose that field_gradient writes.
-GRADIENT_NUMBERS = wp.constant(13)
+VALUE, SLOPE, MATRIX, START = 3, 4, 7, 13
+DAMPING, STEPS, CALM, ENDED = 15, 16, 17, 18
 Numbers = wp.types.vector(length=13, dtype=wp.float64)
 # Longest and largest step [m, rad], and the farthest that a climb leads from its start [m].
-LONGEST, LARGEST, FARTHEST_CLIMB = (
-    wp.constant(wp.float64(0.5)),
-    wp.constant(wp.float64(0.3)),
-    wp.constant(wp.float64(5.0)),
-)
+LONGEST, LARGEST, FARTHEST_CLIMB = wp.float64(0.5), wp.float64(0.3), wp.float64(5.0)
 # Damping of a direction without information, relative to the largest information.
-LEAST = wp.constant(wp.float64(1e-6))
-ZERO, HALF, ONE, TWO = (wp.constant(wp.float64(number)) for number in (0.0, 0.5, 1.0, 2.0))
-FIVE, EIGHT, MOST = (wp.constant(wp.float64(number)) for number in (5.0, 8.0, 1e6))
+LEAST = wp.float64(1e-6)
+ZERO, HALF, ONE, TWO = (wp.float64(number) for number in (0.0, 0.5, 1.0, 2.0))
+FIVE, EIGHT, MOST = (wp.float64(number) for number in (5.0, 8.0, 1e6))
 
 
 @wp.func

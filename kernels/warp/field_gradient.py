@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from gpusense.interface.constants import GRADIENT_NUMBERS
+
 from .end_point import EndPoint, end_point, field_cell
 from .error_free import add_term
 from .field_term import bilinear, field_exponent, field_square, log_field
@@ -10,7 +12,6 @@ from .hit_shape import shape_weight
 from .prelude import kernel, reader, work_item
 from .types import FieldTerms, Window, real, vec2, vec4
 
-GRADIENT_NUMBERS = wp.constant(13)
 number_at = reader(real)
 ZERO, ONE = real(0.0), real(1.0)
 

@@ -2,62 +2,34 @@
 
 import warp as wp
 
+from gpusense.interface import constants, formulas
+
 from .flags import HUGE_HEADINGS
 from .float64.error_free import pair_product, two_sum
+from .prelude import doubles
 
-# Up to this heading the counts of quarter turns have 20 bits.
-LARGEST_HEADING = wp.constant(wp.float64(1048576.0))
-TWO_OVER_PI = wp.constant(wp.float64(0.6366197723675814))
-# 1.5 * 2^52: adding it rounds to an integer.
-ROUNDER = wp.constant(wp.float64(6755399441055744.0))
-# pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
-QUARTER_1 = wp.constant(wp.float64(1.5707963267341256))
-QUARTER_2 = wp.constant(wp.float64(6.077100506303966e-11))
-QUARTER_3 = wp.constant(wp.float64(2.0222662487111665e-21))
-QUARTER_4 = wp.constant(wp.float64(8.4784276603689e-32))
-QUARTER = wp.constant(wp.float64(1.5707963267948966))
-QUARTER_LOW = wp.constant(wp.float64(6.123233995736766e-17))
-# S and C, lowest power first; their relative errors are 2^-56.4 and 2^-59.6.
-S0 = wp.constant(wp.float64(-0.1666666666666663))
-S1 = wp.constant(wp.float64(0.008333333333322118))
-S2 = wp.constant(wp.float64(-0.00019841269829589585))
-S3 = wp.constant(wp.float64(2.7557313621399067e-06))
-S4 = wp.constant(wp.float64(-2.505074776451535e-08))
-S5 = wp.constant(wp.float64(1.5896230233207278e-10))
-C0 = wp.constant(wp.float64(0.041666666666666595))
-C1 = wp.constant(wp.float64(-0.0013888888888873056))
-C2 = wp.constant(wp.float64(2.4801587288851755e-05))
-C3 = wp.constant(wp.float64(-2.7557314179308847e-07))
-C4 = wp.constant(wp.float64(2.087570084339475e-09))
-C5 = wp.constant(wp.float64(-1.1358536585312173e-11))
-ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
+f = doubles(formulas)
+LARGEST_HEADING = wp.float64(constants.LARGEST_HEADING)
+S0, S1, S2, S3, S4, S5 = map(wp.float64, formulas.S)
+C0, C1, C2, C3, C4, C5 = map(wp.float64, formulas.C)
+ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 # Values of the pieces of a turn, in quarters.
-PIECE_1, PIECE_2 = wp.constant(wp.float64(2.0**-32)), wp.constant(wp.float64(2.0**-62))
-PIECE_3, PIECE_4 = wp.constant(wp.float64(2.0**-92)), wp.constant(wp.float64(2.0**-122))
-# The bits of 2/pi in words of 32 after two words of zeros.
-# fmt: off
-WORDS = wp.constant(wp.types.vector(length=39, dtype=wp.uint32)(
-    0x00000000, 0x00000000, 0xA2F9836E, 0x4E441529, 0xFC2757D1, 0xF534DDC0, 0xDB629599, 0x3C439041, 0xFE5163AB,
-    0xDEBBC561, 0xB7246E3A, 0x424DD2E0, 0x06492EEA, 0x09D1921C, 0xFE1DEB1C, 0xB129A73E, 0xE88235F5, 0x2EBB4484,
-    0xE99C7026, 0xB45F7E41, 0x3991D639, 0x835339F4, 0x9C845F8B, 0xBDF9283B, 0x1FF897FF, 0xDE05980F, 0xEF2F118B,
-    0x5A0A6D1F, 0x6D367ECF, 0x27CB09B7, 0x4F463F66, 0x9E5FEA2D, 0x7527BAC7, 0xEBE5F17B, 0x3D0739F7, 0x8A5292EA,
-    0x6BFB5FB1, 0x1F8D5D08, 0x56033046,
-))
-# fmt: on
-MASK_52, ONE_52 = wp.constant(wp.uint64(0xFFFFFFFFFFFFF)), wp.constant(wp.uint64(0x10000000000000))
-MASK_32, MASK_30 = wp.constant(wp.uint64(0xFFFFFFFF)), wp.constant(wp.uint64(0x3FFFFFFF))
-MASK_62, EIGHTH = wp.constant(wp.uint64(0x3FFFFFFFFFFFFFFF)), wp.constant(wp.uint64(0x2000000000000000))
-SIGNED_MASK_30, SIGNED_EIGHTH = wp.constant(wp.int64(0x3FFFFFFF)), wp.constant(wp.int64(0x2000000000000000))
+PIECE_1, PIECE_2 = wp.float64(2.0**-32), wp.float64(2.0**-62)
+PIECE_3, PIECE_4 = wp.float64(2.0**-92), wp.float64(2.0**-122)
+MASK_52, ONE_52 = wp.uint64(0xFFFFFFFFFFFFF), wp.uint64(0x10000000000000)
+MASK_32, MASK_30 = wp.uint64(0xFFFFFFFF), wp.uint64(0x3FFFFFFF)
+MASK_62, EIGHTH = wp.uint64(0x3FFFFFFFFFFFFFFF), wp.uint64(0x2000000000000000)
+SIGNED_MASK_30, SIGNED_EIGHTH = wp.int64(0x3FFFFFFF), wp.int64(0x2000000000000000)
 
 
 @wp.func
 def reduce_ordinary(theta: wp.float64):
     """Reduce a heading of at most LARGEST_HEADING to quarter turns modulo 4 and the sum of two numbers."""
-    count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
+    count = (theta * f.TWO_OVER_PI + f.ROUNDER) - f.ROUNDER
     # The first product and difference are exact, and so are the next two products.
-    first = two_sum(theta - count * QUARTER_1, -(count * QUARTER_2))
-    second = two_sum(first.x, -(count * QUARTER_3))
-    low = (first.y + second.y) - count * QUARTER_4
+    first = two_sum(theta - count * f.QUARTER_1, -(count * f.QUARTER_2))
+    second = two_sum(first.x, -(count * f.QUARTER_3))
+    low = (first.y + second.y) - count * f.QUARTER_4
     return int(count) & 3, two_sum(second.x, low)
 
 
@@ -83,7 +55,7 @@ def reduce_huge(theta: wp.float64):
     below = wp.uint64(0)
     for i in range(6):
         k = 5 - i
-        both = wp.uint64(WORDS[word + k]) << wp.uint64(32) | wp.uint64(WORDS[word + k + 1])
+        both = wp.uint64(f.WORDS[word + k]) << wp.uint64(32) | wp.uint64(f.WORDS[word + k + 1])
         here = both << shift >> wp.uint64(32)
         sum_1 = low_half * here + carry_1
         sum_2 = high_half * below + (sum_1 & MASK_32) + carry_2
@@ -106,7 +78,7 @@ def reduce_huge(theta: wp.float64):
     piece_4 = wp.float64((turn_low >> wp.uint64(4)) & MASK_30) * PIECE_4
     total = two_sum(piece_1, piece_2)
     quarters = two_sum(total.x, total.y + (piece_3 + piece_4))
-    angle = pair_product(quarters, wp.vec2d(QUARTER, QUARTER_LOW))
+    angle = pair_product(quarters, wp.vec2d(f.QUARTER, f.QUARTER_LOW))
     back = theta < ZERO
     return wp.where(back, -quadrant, quadrant) & 3, wp.where(back, wp.vec2d(-angle.x, -angle.y), angle)
 

@@ -9,9 +9,9 @@ from .prelude import reader
 from .types import real, vec2
 
 number_at = reader(real)
-TABLE_CELLS = wp.constant(1024 if FLOAT64 else 256)
+TABLE_CELLS = 1024 if FLOAT64 else 256
 TABLE_PER_LOG = real(27.0 if FLOAT64 else 16.0)
-TABLE_POWERS = wp.constant(8 if FLOAT64 else 5)
+TABLE_POWERS = 8 if FLOAT64 else 5
 ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
 
 

@@ -2,7 +2,9 @@
 
 import warp as wp
 
-from .icp_match import MATCH_RESULT, match_in_turns
+from gpusense.interface.constants import MATCH_RESULT
+
+from .icp_match import match_in_turns
 from .icp_step import TEAM
 from .prelude import kernel, work_item
 

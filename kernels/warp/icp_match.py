@@ -2,17 +2,17 @@
 
 import warp as wp
 
+from gpusense.interface.constants import MATCH_RESULT, MATCH_RULES
+
 from .icp_pairs import agreement, sum_pairs
 from .icp_step import MATCH_BLOCKS, Blocks, Sums, solve
 from .types import MatchRules, real, vec4
 
-# Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6), and
-# its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points that
-# the other scan should see, points through which it saw, points that it did not see, and for blocks of 1, 2, 4 to 128
-# successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
-MATCH_RESULT = wp.constant(35)
-# Numbers of the rules of a level.
-MATCH_RULES = wp.constant(14)
+# The MATCH_RESULT numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances,
+# information (6), and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared
+# errors, points that the other scan should see, points through which it saw, points that it did not see, and for
+# blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with
+# thin; the last step (3).
 ZERO, ONE, HALF = real(0.0), real(1.0), real(0.5)
 TENTH, TEN, LARGEST_TURN, QUIET_TURN = real(0.1), real(10.0), real(0.3), real(0.03)
 # Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.

@@ -1,11 +1,4 @@
-"""Pairs of point-to-line ICP: nearest points, sums over pairs, and the agreement of two scans.
-
-The nearest point is exact: the points of a scan are sorted by bearing, and a search outwards from the bearing of a
-place ends where no point farther in bearing can be nearer.
-
-Lines: see line_fit.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the
-scale shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
-"""
+"""Pairs of point-to-line ICP: nearest points, sums over pairs, and the agreement of two scans."""
 
 import warp as wp
 

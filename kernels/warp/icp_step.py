@@ -1,6 +1,4 @@
-"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a scan, the
-normal equations, sums of blocks of points, and sums over a team of work-items.
-"""
+"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share."""
 
 import warp as wp
 

@@ -1,59 +1,17 @@
-"""Search for the landmarks near the end point of a feature, book table 6.5.
-
-Landmarks are stored in square buckets, row by row; start[i] is the first landmark of bucket i. A search visits the
-buckets that a disc around the feature's end point touches, and evaluates the landmarks within the disc; landmarks
-outside have a negligible density.
-
-Density of a line of a scan, in normal form, given a line of the map; ends do not count.
-
-    p(f | j) = N((alpha, rho); (alpha_j, rho_j), C) / m
-
-A line is the points with x cos alpha + y sin alpha = rho: alpha is the direction of its normal, away from the sensor,
-and rho its distance (Siegwart, Nourbakhsh and Scaramuzza, *Introduction to Autonomous Mobile Robots*, 2011, section
-4.7). alpha_j and rho_j describe the map's line at the particle; alpha - alpha_j is wrapped to (-pi, pi]. (alpha, rho)
-and (alpha + pi, -rho) are one line: where a line of the map is seen from both sides, the normal nearer to the feature's
-counts. m is the mass of the distance on [0, range_max]. By Cholesky's factor of C the exponent is (a da)^2 + (b da + c
-dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of the map if its projection
-overlaps that line: a scan shows only the visible part of a wall. A line of the map has its middle as landmark, its
-normal away from the free side, and (half length, 1 if it is seen from both sides, 0, 0) as signature.
-"""
+"""Search for the landmarks near the end point of a feature, book table 6.5."""
 
 import math
 
 import warp as wp
 
+from gpusense.interface import feature_layout as at
+
 from .error_free import add_term, pair_product, pair_sum, two_sum
 from .flags import FLOAT64, LINE, MARGINAL
-from .landmarks import (
-    AXIS,
-    BEARING_SCALE,
-    BEARING_SCALE_LOW,
-    BEARING_SPREAD,
-    FARTHEST,
-    HOLE,
-    MOST,
-    PEAK,
-    PEAK_LOW,
-    RADIUS,
-    RANGE_AT,
-    RANGE_LOW,
-    RANGE_SCALE,
-    RANGE_SCALE_LOW,
-    RANGE_SPREAD,
-    REACH,
-    SLACK,
-    across,
-    add_square,
-    along,
-    angle_pair,
-    log_detection,
-)
+from .landmarks import across, add_square, along, angle_pair, log_detection
 from .log_terms import offset
 from .types import Buckets, FeatureTerms, real, vec2, vec4
 
-# The factor of the angle in the second exponent; places of the ends along the line, from the foot of the normal.
-MIXED_SCALE, MIXED_SCALE_LOW = wp.constant(12), wp.constant(13)
-FIRST_END, LAST_END = wp.constant(17), wp.constant(18)
 ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
 NEVER = real(-math.inf)
 # A sum of densities is relative to one of them, until another is larger by a factor of e^RELATIVE.
@@ -77,11 +35,11 @@ def overlaps(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.in
     """Return whether a feature has about the direction of a line of the map, and overlaps it."""
     cosine = normal[0] * turned[0] + normal[2] * turned[2]
     sine = normal[0] * turned[2] - normal[2] * turned[0]
-    foot = feature[base + RANGE_AT] * sine - (normal[0] * off[2] - normal[2] * off[0])
-    one = foot + feature[base + FIRST_END] * cosine
-    other = foot + feature[base + LAST_END] * cosine
+    foot = feature[base + at.RANGE_AT] * sine - (normal[0] * off[2] - normal[2] * off[0])
+    one = foot + feature[base + at.FIRST_END] * cosine
+    other = foot + feature[base + at.LAST_END] * cosine
     beside = wp.min(one, other) <= signature[0] and wp.max(one, other) >= -signature[0]
-    return cosine >= feature[base + AXIS] and beside
+    return cosine >= feature[base + at.AXIS] and beside
 
 
 @wp.func
@@ -106,14 +64,14 @@ def log_line(
     """Return log(z_detect p(f | j)) of one feature at the offset of a line's middle."""
     da = angle_pair(across(turned, normal), along(turned, normal), arcs)
     d = along(off, normal)
-    first = two_sum(feature[base + RANGE_AT], -d[0])
-    dr = two_sum(first[0], first[1] + (feature[base + RANGE_LOW] - d[1]))
-    mixed = pair_product(da, vec2(feature[base + MIXED_SCALE], feature[base + MIXED_SCALE_LOW]))
-    plain = pair_product(dr, vec2(feature[base + RANGE_SCALE], feature[base + RANGE_SCALE_LOW]))
-    exponent = add_square(vec2(ZERO, ZERO), da, feature[base + BEARING_SCALE], feature[base + BEARING_SCALE_LOW])
+    first = two_sum(feature[base + at.RANGE_AT], -d[0])
+    dr = two_sum(first[0], first[1] + (feature[base + at.RANGE_LOW] - d[1]))
+    mixed = pair_product(da, vec2(feature[base + at.MIXED_SCALE], feature[base + at.MIXED_SCALE_LOW]))
+    plain = pair_product(dr, vec2(feature[base + at.RANGE_SCALE], feature[base + at.RANGE_SCALE_LOW]))
+    exponent = add_square(vec2(ZERO, ZERO), da, feature[base + at.BEARING_SCALE], feature[base + at.BEARING_SCALE_LOW])
     exponent = add_square(exponent, pair_sum(mixed, plain), ONE, ZERO)
-    mass = distance_mass(d, feature[base + RANGE_SPREAD], signature, terms)
-    log_p = (feature[base + PEAK] - exponent[0]) + (feature[base + PEAK_LOW] - exponent[1])
+    mass = distance_mass(d, feature[base + at.RANGE_SPREAD], signature, terms)
+    log_p = (feature[base + at.PEAK] - exponent[0]) + (feature[base + at.PEAK_LOW] - exponent[1])
     if mass != ONE:
         log_p = log_p - wp.log(mass)
     return log_p
@@ -138,9 +96,9 @@ def bucket_at(position: real, size: real, count: wp.int32):
 @wp.func
 def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, most: real):
     """Return whether a landmark is in a feature's disc, and within limits that the feature does not measure."""
-    reach = feature[base + REACH]
-    radius = feature[base + RADIUS]
-    hole = feature[base + HOLE]
+    reach = feature[base + at.REACH]
+    radius = feature[base + at.RADIUS]
+    hole = feature[base + at.HOLE]
     x = off[0] - reach * turned[0]
     y = off[2] - reach * turned[2]
     squared = off[0] * off[0] + off[2] * off[2]
@@ -148,10 +106,10 @@ def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32,
     if apart > radius * radius or squared < hole * hole:
         return False
     # The bound most holds for a disc around the end point itself.
-    if reach > ZERO and reach == feature[base + RANGE_AT] and apart > most:
+    if reach > ZERO and reach == feature[base + at.RANGE_AT] and apart > most:
         return False
     d = wp.sqrt(squared)
-    return d <= feature[base + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[base + AXIS] * d
+    return d <= feature[base + at.FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[base + at.AXIS] * d
 
 
 @wp.func
@@ -159,10 +117,10 @@ def squared_reach(exponent: real, feature: wp.array(dtype=real), base: wp.int32)
     """Return the square of the radius around a feature's end point outside which exponents are larger than exponent."""
     squared = real(0.0)
     if exponent > ZERO:
-        r = wp.sqrt(exponent) * feature[base + RANGE_SPREAD]
-        b = wp.sqrt(exponent) * feature[base + BEARING_SPREAD]
-        z = feature[base + RANGE_AT]
-        squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + SLACK]
+        r = wp.sqrt(exponent) * feature[base + at.RANGE_SPREAD]
+        b = wp.sqrt(exponent) * feature[base + at.BEARING_SPREAD]
+        z = feature[base + at.RANGE_AT]
+        squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + at.SLACK]
     return squared
 
 
@@ -225,8 +183,8 @@ def search(
     match.best = NEVER
     match.chosen = -1
     match.total = vec2(ZERO, ZERO)
-    reach = feature[base + REACH]
-    radius = feature[base + RADIUS]
+    reach = feature[base + at.REACH]
+    radius = feature[base + at.RADIUS]
     if radius < ZERO:
         return match
     # Landmarks that cannot be likelier than the best so far are not evaluated.
@@ -246,7 +204,7 @@ def search(
                 log_p = log_match(off, turned, feature, base, normal, signature, j, terms, arcs)
                 match = with_landmark(match, log_p, j)
                 if not MARGINAL and not LINE:
-                    most = squared_reach(feature[base + MOST] - match.best, feature, base)
+                    most = squared_reach(feature[base + at.MOST] - match.best, feature, base)
             j += 1
         row += 1
     if MARGINAL:

@@ -4,9 +4,11 @@ import math
 
 import warp as wp
 
+from gpusense.interface import feature_layout as at
+
 from .flags import PER_BEAM
 from .landmark_grid import log_match, may_match
-from .landmarks import FALSE_POSITIVE, FEATURE, GROUP, RADIUS, direction, sensor_place
+from .landmarks import direction, sensor_place
 from .log_terms import either, offset
 from .prelude import kernel
 from .types import real
@@ -34,7 +36,7 @@ def add_landmark(
         s = sets - 1 - step % (sets - 1)
         k = int(0)
         while k < features:
-            if ((s >> k) & 1) != 0 and int(feature[FEATURE * k + GROUP]) == group:
+            if ((s >> k) & 1) != 0 and int(feature[at.FEATURE * k + at.GROUP]) == group:
                 less = s ^ (1 << k)
                 joined = best[sums + less] + log_each[k]
                 if joined > best[sums + s]:
@@ -59,7 +61,7 @@ def set_total(s: wp.int32, sum_of_set: real, feature: wp.array(dtype=real), feat
     k = int(0)
     while k < features:
         if ((s >> k) & 1) == 0:
-            total += feature[FEATURE * k + FALSE_POSITIVE]
+            total += feature[at.FEATURE * k + at.FALSE_POSITIVE]
         k += 1
     return total
 
@@ -107,7 +109,7 @@ def joint_features(
     groups = int(1)
     k = int(0)
     while k < features:
-        groups = wp.max(groups, int(feature[FEATURE * k + GROUP]) + 1)
+        groups = wp.max(groups, int(feature[at.FEATURE * k + at.GROUP]) + 1)
         k += 1
     log_each = LogEach()
     j = int(0)
@@ -115,13 +117,13 @@ def joint_features(
         off = offset(landmark[j], place)
         k = int(0)
         while k < features:
-            base = FEATURE * k
+            base = at.FEATURE * k
             turned = direction(high, low, feature, base)
             log_each[k] = NEVER
-            if feature[base + RADIUS] >= ZERO:
+            if feature[base + at.RADIUS] >= ZERO:
                 if may_match(off, turned, feature, base, normal, signature, j, EVERYWHERE):
                     detected = log_match(off, turned, feature, base, normal, signature, j, terms, arcs)
-                    log_each[k] = either(detected, feature[base + FALSE_POSITIVE])
+                    log_each[k] = either(detected, feature[base + at.FALSE_POSITIVE])
             k += 1
         add_landmark(j, log_each, feature, best, choice, value, sums, begin, features, sets, groups)
         j += 1
@@ -130,7 +132,7 @@ def joint_features(
     if PER_BEAM:
         k = int(0)
         while k < features:
-            false_positive = feature[FEATURE * k + FALSE_POSITIVE]
+            false_positive = feature[at.FEATURE * k + at.FALSE_POSITIVE]
             each = value[begin + chosen * features + k]
             j = choice[begin + chosen * features + k]
             which[n * features + k] = wp.where(each - false_positive >= LOG_2, j, -1)

@@ -4,10 +4,13 @@ import math
 
 import warp as wp
 
-from .error_free import BLOCK_TERMS, add_term
+from gpusense.interface import feature_layout as at
+from gpusense.interface.constants import BLOCK_TERMS
+
+from .error_free import add_term
 from .flags import FIELD, KNOWN, PER_BEAM
 from .landmark_grid import bucket_at, log_match, search
-from .landmarks import FALSE_POSITIVE, FEATURE, direction, sensor_place
+from .landmarks import direction, sensor_place
 from .log_terms import either, offset
 from .prelude import kernel
 from .types import real, vec2, vec4
@@ -35,7 +38,7 @@ def score_features(
         block = real(0.0)
         k = first
         while k < last:
-            base = FEATURE * k
+            base = at.FEATURE * k
             turned = direction(high, low, feature, base)
             detected = real(0.0)
             best = real(0.0)
@@ -49,7 +52,7 @@ def score_features(
                 detected = match.log_p
                 best = match.best
                 chosen = match.chosen
-            value = either(detected + share, feature[base + FALSE_POSITIVE])
+            value = either(detected + share, feature[base + at.FALSE_POSITIVE])
             if wp.isinf(value):
                 impossible = True
             else:
@@ -59,7 +62,7 @@ def score_features(
                 if KNOWN:
                     which[n * features + k] = chosen
                 else:
-                    which[n * features + k] = wp.where(best + share >= feature[base + FALSE_POSITIVE], chosen, -1)
+                    which[n * features + k] = wp.where(best + share >= feature[base + at.FALSE_POSITIVE], chosen, -1)
             k += 1
         total = add_term(total, block)
         first = last

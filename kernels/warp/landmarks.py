@@ -2,37 +2,15 @@
 
 import warp as wp
 
+from gpusense.interface import feature_layout as at
+
 from .error_free import pair_product, pair_sum, two_product, two_sum
 from .flags import BEARING, FIELD, FLOAT64, RANGE, SIGNATURE
 from .log_terms import distance_pair
 from .types import FeatureTerms, real, vec2, vec4
 
-# Range; cosine and sine of the bearing on the robot; signature.
-RANGE_AT, RANGE_LOW = wp.constant(0), wp.constant(1)
-COSINE, SINE, COSINE_LOW, SINE_LOW = wp.constant(2), wp.constant(3), wp.constant(4), wp.constant(5)
-SIGNATURE_AT, SIGNATURE_LOW = wp.constant(6), wp.constant(7)
-# 1 / (sigma sqrt 2), 0 for components that were not measured; logs of z_detect and the components' peaks, of the false
-# positive.
-RANGE_SCALE, RANGE_SCALE_LOW = wp.constant(8), wp.constant(9)
-BEARING_SCALE, BEARING_SCALE_LOW = wp.constant(10), wp.constant(11)
-SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = wp.constant(12), wp.constant(13)
-PEAK, PEAK_LOW, FALSE_POSITIVE = wp.constant(14), wp.constant(15), wp.constant(16)
-# Angle from the bearing to the upper end of the field of view.
-UPPER, UPPER_LOW = wp.constant(17), wp.constant(18)
-# Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is not
-# negligible; RADIUS is negative where none has.
-REACH, RADIUS, HOLE = wp.constant(19), wp.constant(20), wp.constant(21)
-# The sensor's limits for components that a feature does not measure: the distance, the cosine of the angle to the axis.
-FARTHEST, AXIS = wp.constant(22), wp.constant(23)
-# sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
-# density; and the largest error of squared distances.
-RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = wp.constant(24), wp.constant(25), wp.constant(26), wp.constant(27)
-# Features of one group have different landmarks in a joint association; features of two groups may share one.
-GROUP = wp.constant(28)
-FEATURE = wp.constant(29)
 # Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
-ARC_STEPS = wp.constant(8)
-QUARTER_TURN, HALF_TURN = wp.constant(9), wp.constant(10)
+QUARTER_TURN, HALF_TURN = 9, 10
 ZERO, HALF, ONE, TWO, STEPS = real(0.0), real(0.5), real(1.0), real(2.0), real(8.0)
 # Below this distance [m] all bearings are equally likely.
 ZERO_RANGE = real(1e-6)
@@ -53,10 +31,10 @@ def sensor_place(cell: wp.vec2i, pose: vec4, low: vec4, size: real):
 @wp.func
 def direction(pose: vec4, pose_low: vec4, feature: wp.array(dtype=real), base: wp.int32):
     """Return the direction of a feature in the world: the heading, turned by the bearing."""
-    c = feature[base + COSINE]
-    s = feature[base + SINE]
-    c_low = feature[base + COSINE_LOW]
-    s_low = feature[base + SINE_LOW]
+    c = feature[base + at.COSINE]
+    s = feature[base + at.SINE]
+    c_low = feature[base + at.COSINE_LOW]
+    s_low = feature[base + at.SINE_LOW]
     cc = two_product(pose[2], c)
     ss = two_product(pose[3], s)
     cs = two_product(pose[2], s)
@@ -193,35 +171,39 @@ def log_detection(
     norm = real(0.0)
     d = distance_pair(off)
     if RANGE:
-        if feature[base + RANGE_SCALE] > ZERO:
-            first = two_sum(d[0], -feature[base + RANGE_AT])
-            r = two_sum(first[0], first[1] + (d[1] - feature[base + RANGE_LOW]))
-            exponent = add_square(exponent, r, feature[base + RANGE_SCALE], feature[base + RANGE_SCALE_LOW])
-            mass = range_mass(d, feature[base + RANGE_SCALE], terms)
+        if feature[base + at.RANGE_SCALE] > ZERO:
+            first = two_sum(d[0], -feature[base + at.RANGE_AT])
+            r = two_sum(first[0], first[1] + (d[1] - feature[base + at.RANGE_LOW]))
+            exponent = add_square(exponent, r, feature[base + at.RANGE_SCALE], feature[base + at.RANGE_SCALE_LOW])
+            mass = range_mass(d, feature[base + at.RANGE_SCALE], terms)
     if BEARING:
-        if feature[base + BEARING_SCALE] > ZERO:
+        if feature[base + at.BEARING_SCALE] > ZERO:
             if d[0] > ZERO_RANGE:
                 angle = angle_pair(across(off, turned), along(off, turned), arcs)
-                exponent = add_square(exponent, angle, feature[base + BEARING_SCALE], feature[base + BEARING_SCALE_LOW])
+                exponent = add_square(
+                    exponent, angle, feature[base + at.BEARING_SCALE], feature[base + at.BEARING_SCALE_LOW]
+                )
                 if FIELD:
                     mass = mass * field_mass(
                         angle,
-                        feature[base + UPPER],
-                        feature[base + UPPER_LOW],
-                        feature[base + BEARING_SCALE],
+                        feature[base + at.UPPER],
+                        feature[base + at.UPPER_LOW],
+                        feature[base + at.BEARING_SCALE],
                         terms,
                         arcs,
                     )
             else:
                 # The density is 1 / field: the peak times zero_range_density and the scale.
-                mass = mass * (terms[0].zero_range_density * feature[base + BEARING_SCALE])
+                mass = mass * (terms[0].zero_range_density * feature[base + at.BEARING_SCALE])
     if SIGNATURE:
-        if feature[base + SIGNATURE_SCALE] > ZERO:
-            away = two_sum(feature[base + SIGNATURE_AT], -signature[0])
-            s = two_sum(away[0], away[1] + (feature[base + SIGNATURE_LOW] - signature[1]))
-            exponent = add_square(exponent, s, feature[base + SIGNATURE_SCALE], feature[base + SIGNATURE_SCALE_LOW])
+        if feature[base + at.SIGNATURE_SCALE] > ZERO:
+            away = two_sum(feature[base + at.SIGNATURE_AT], -signature[0])
+            s = two_sum(away[0], away[1] + (feature[base + at.SIGNATURE_LOW] - signature[1]))
+            exponent = add_square(
+                exponent, s, feature[base + at.SIGNATURE_SCALE], feature[base + at.SIGNATURE_SCALE_LOW]
+            )
             norm = signature[2]
-    log_p = (feature[base + PEAK] - exponent[0]) + ((feature[base + PEAK_LOW] - exponent[1]) + norm)
+    log_p = (feature[base + at.PEAK] - exponent[0]) + ((feature[base + at.PEAK_LOW] - exponent[1]) + norm)
     if mass != ONE:
         log_p = log_p - wp.log(mass)
     return log_p

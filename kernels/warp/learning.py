@@ -4,7 +4,8 @@ import math
 
 import warp as wp
 
-from .error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS
+
 from .flags import INFORMATION
 from .hit_shape import shape_bend, shape_exponent, shape_weight
 from .mixture import above_mean, hit_offset, log_hit, log_short, mass_within, mean_range, short_factor

@@ -1,6 +1,4 @@
-"""Expected range by a look-up table over cells and angle bins (precomputed ranges, book section 6.3):
-for each cell and bin the range from the cell's centre in the bin's direction, in units of limit / 65 535.
-"""
+"""Expected range by a look-up table over cells and angle bins (precomputed ranges, book section 6.3)."""
 
 import warp as wp
 

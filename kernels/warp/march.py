@@ -1,6 +1,4 @@
-"""Expected range by marching through the distance field (sphere tracing): each step is the distance from the current
-cell's centre to the nearest obstacle's centre less slack, and at least tolerance.
-"""
+"""Expected range by marching through the distance field (sphere tracing)."""
 
 import warp as wp
 

@@ -1,20 +1,15 @@
-"""An order of particles in which neighbours have similar positions and headings. Their rays then read the same cells
-and have similar lengths, so work-items wait less for each other. The order changes no result.
-"""
+"""An order of particles in which neighbours have similar positions and headings."""
 
 import warp as wp
+
+from gpusense.interface.constants import ALL_BINS, BINS, STRETCH
 
 from .prelude import kernel, work_item
 from .ray import turn_of
 from .types import real, vec2, vec4
 
-# Sampled particles; bins per axis (rows, columns, headings); and bins per work-item of order_starts.
-SAMPLES = wp.constant(256)
-BINS = wp.constant(32)
-ALL_BINS = wp.constant(32768)
-STRETCH = wp.constant(16)
-# STRETCH as a constant of loops that Warp shall unroll.
-EACH = 16
+# Sampled particles.
+SAMPLES = 256
 stretch_counts = wp.types.vector(length=16, dtype=wp.int32)
 ZERO, ONE = real(0.0), real(1.0)
 # Units of a turn.
@@ -81,13 +76,13 @@ def order_starts(bounds, bins):
     begin = stretch * STRETCH
     # All are read before any is used, so that a work-item waits once for them.
     counts = stretch_counts()
-    for i in range(EACH):
+    for i in range(STRETCH):
         counts[i] = bins[begin + i]
     total = int(0)
-    for i in range(EACH):
+    for i in range(STRETCH):
         total += counts[i]
     start = int(wp.atomic_add(bounds, 6, total))
-    for i in range(EACH):
+    for i in range(STRETCH):
         bins[begin + i] = start
         start += counts[i]
 

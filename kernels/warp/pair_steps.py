@@ -8,19 +8,19 @@ from .reading_class import is_hit
 from .sorting import sort_numbers
 from .types import real, vec4
 
-ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
-FOREVER = wp.constant(wp.float64(math.inf))
+ZERO, ONE, MINUS_ONE = wp.float64(0.0), wp.float64(1.0), wp.float64(-1.0)
+FOREVER = wp.float64(math.inf)
 # Median absolute value of a normal error [standard deviations], and the deviation of rounding to steps of sqrt(12).
-MEDIAN, ROOT_OF_12 = wp.constant(wp.float64(0.6745)), wp.constant(wp.float64(3.4641016151377544))
+MEDIAN, ROOT_OF_12 = wp.float64(0.6745), wp.float64(3.4641016151377544)
 # Neighbours whose ranges differ by more than this share do not belong to one surface.
-LARGEST_STEP = wp.constant(wp.float64(0.35))
+LARGEST_STEP = wp.float64(0.35)
 # Ranges come in steps if all differences are multiples of a step of at least this size [m], to within this share of it.
-LEAST_STEP, LEAST_GAP = wp.constant(wp.float64(1e-3)), wp.constant(wp.float64(0.5e-3))
-ODD = wp.constant(wp.float64(0.02))
+LEAST_STEP, LEAST_GAP = wp.float64(1e-3), wp.float64(0.5e-3)
+ODD = wp.float64(0.02)
 # Least beams for an estimate of noise.
-LEAST_BEAMS = wp.constant(12)
+LEAST_BEAMS = 12
 # Points nearer than this have no bearing [m].
-NEAREST = wp.constant(wp.float64(1e-6))
+NEAREST = wp.float64(1e-6)
 
 
 @wp.func

@@ -1,20 +1,16 @@
-"""Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index.
-
-Philox 4x32-10: Salmon, Moraes, Dror and Shaw, *Parallel random numbers: as easy as 1, 2, 3* (2011). Normal deviates are
-those of Box and Muller: sqrt(-2 log u) (cos 2 pi v, sin 2 pi v). The counter is (particle, step, stream, 0).
-"""
+"""Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index."""
 
 import warp as wp
 
 from .elementary import log_of
 from .heading import cos_sin
 
-MULTIPLIER_0, MULTIPLIER_1 = wp.constant(wp.uint64(0xD2511F53)), wp.constant(wp.uint64(0xCD9E8D57))
-WEYL_0, WEYL_1 = wp.constant(wp.uint32(0x9E3779B9)), wp.constant(wp.uint32(0xBB67AE85))
+MULTIPLIER_0, MULTIPLIER_1 = wp.uint64(0xD2511F53), wp.uint64(0xCD9E8D57)
+WEYL_0, WEYL_1 = wp.uint32(0x9E3779B9), wp.uint32(0xBB67AE85)
 # 2^-32, and that many turns in radians.
-WORD, WORD_TURN = wp.constant(wp.float64(2.3283064365386963e-10)), wp.constant(wp.float64(1.4629180792671596e-09))
-HALF, MINUS_TWO = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(-2.0))
-SHIFT, NONE = wp.constant(wp.uint64(32)), wp.constant(wp.uint32(0))
+WORD, WORD_TURN = wp.float64(2.3283064365386963e-10), wp.float64(1.4629180792671596e-09)
+HALF, MINUS_TWO = wp.float64(0.5), wp.float64(-2.0)
+SHIFT, NONE = wp.uint64(32), wp.uint32(0)
 words_4 = wp.types.vector(length=4, dtype=wp.uint32)
 
 

@@ -8,9 +8,9 @@ from .prelude import kernel, work_item
 from .types import Frame, Window, coordinate, real, vec4
 
 # Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
-FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
-INFINITE, MINUS_INFINITE = wp.constant(wp.float64(float("inf"))), wp.constant(wp.float64(float("-inf")))
-ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+FARTHEST, MINUS_FARTHEST = wp.float64(1073741824.0), wp.float64(-1073741824.0)
+INFINITE, MINUS_INFINITE = wp.float64(float("inf")), wp.float64(float("-inf"))
+ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
 
 
 @wp.func

@@ -161,6 +161,20 @@ def _struct(name, real):
     return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
 
 
+@functools.cache
+def doubles(module):
+    """Return the numbers of a module as float64, and its tuples and lists as vectors of float64 or of words."""
+    made = ModuleType(module.__name__)
+    for name, value in vars(module).items():
+        if isinstance(value, float):
+            value = wp.float64(value)
+        elif isinstance(value, (tuple, list)):
+            dtype = wp.float64 if isinstance(value[0], float) else wp.uint32
+            value = wp.types.vector(length=len(value), dtype=dtype)(*value)
+        setattr(made, name, value)
+    return made
+
+
 # Return the work-item of a launch of one dimension, given wp.tid(), which divides a number of 64 bits by 1.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)

@@ -2,13 +2,12 @@
 
 import warp as wp
 
+from gpusense.interface.constants import TILE, TILE_PARTICLES, TILE_RAYS
+
 from .flags import AMCL_LINES, FLOAT64, ORIGINS_OUTSIDE
 from .types import RangeScale, Window, real, vec2, vec4
 
 # Tiles of work-items for GPUs: a work-group takes a tile of neighbouring particles and rays with similar paths.
-TILE_RAYS = wp.constant(4)
-TILE_PARTICLES = wp.constant(16)
-TILE = wp.constant(64)
 
 
 @wp.func

@@ -2,11 +2,11 @@
 
 import warp as wp
 
+from gpusense.interface.constants import RAY_BITS
+
 from .prelude import kernel
 
-# Fraction bits of a coordinate.
-BITS = wp.constant(12)
-UNIT = wp.constant(1 << 12)
+UNIT = 1 << RAY_BITS
 
 
 @wp.func

@@ -2,19 +2,19 @@
 
 import warp as wp
 
+from gpusense.interface import constants, formulas
+
 from .flags import HUGE_HEADINGS
 from .float64.error_free import pair_sum, two_sum
-from .heading import cos_sin, reduce_huge, reduce_ordinary
-from .prelude import kernel
+from .heading import LARGEST_HEADING, cos_sin, reduce_huge, reduce_ordinary
+from .prelude import doubles, kernel
 from .types import real, vec2, vec4
 
-# Coordinates are clamped to this; its square is finite in float32.
-FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(2.0**60)), wp.constant(wp.float64(-(2.0**60)))
-QUARTER, QUARTER_LOW = wp.constant(wp.float64(1.5707963267948966)), wp.constant(wp.float64(6.123233995736766e-17))
-HALF_TURN, MINUS_HALF_TURN = wp.constant(wp.float64(3.141592653589793)), wp.constant(wp.float64(-3.141592653589793))
-ZERO, FOUR = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(4.0))
-MINUS_FOUR = wp.constant(wp.float64(-4.0))
-LARGEST_HEADING = wp.constant(wp.float64(1048576.0))
+FARTHEST, MINUS_FARTHEST = wp.float64(constants.FARTHEST), wp.float64(-constants.FARTHEST)
+f = doubles(formulas)
+MINUS_HALF_TURN = wp.float64(-formulas.HALF_TURN)
+ZERO, FOUR = wp.float64(0.0), wp.float64(4.0)
+MINUS_FOUR = wp.float64(-4.0)
 
 
 @wp.func
@@ -31,10 +31,10 @@ def wrapped_difference(theta: wp.float64, target: wp.vec2d):
         quadrant, rest = reduce_ordinary(theta)
     # Up to three quarters are exact: the last bits of QUARTER are 0.
     quarters = wp.float64(quadrant)
-    angle = pair_sum(wp.vec2d(quarters * QUARTER, quarters * QUARTER_LOW), rest)
+    angle = pair_sum(wp.vec2d(quarters * f.QUARTER, quarters * f.QUARTER_LOW), rest)
     angle = pair_sum(angle, -target)
-    turns = wp.where(angle.x > HALF_TURN, MINUS_FOUR, wp.where(angle.x < MINUS_HALF_TURN, FOUR, ZERO))
-    return pair_sum(angle, wp.vec2d(turns * QUARTER, turns * QUARTER_LOW))
+    turns = wp.where(angle.x > f.HALF_TURN, MINUS_FOUR, wp.where(angle.x < MINUS_HALF_TURN, FOUR, ZERO))
+    return pair_sum(angle, wp.vec2d(turns * f.QUARTER, turns * f.QUARTER_LOW))
 
 
 @wp.func

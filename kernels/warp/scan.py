@@ -4,7 +4,8 @@ import math
 
 import warp as wp
 
-from .error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
+
 from .flags import ALL_READINGS, END_POINTS, SOME_BEAMS
 from .placement import place_pose
 from .prelude import kernel, popcount, work_item
@@ -12,9 +13,8 @@ from .reading_class import is_hit, is_max
 from .types import ReadingRules, measured, real, vec2
 
 # Max readings are left out, part of the constant term, or evaluated like others.
-MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = wp.constant(0), wp.constant(1), wp.constant(2)
-ZERO = wp.constant(wp.float64(0.0))
-MISSING, FAR = wp.constant(wp.float64(math.nan)), wp.constant(wp.float64(math.inf))
+ZERO = wp.float64(0.0)
+MISSING, FAR = wp.float64(math.nan), wp.float64(math.inf)
 
 
 @wp.func

@@ -4,11 +4,6 @@ import warp as wp
 
 from .types import ScoreTable
 
-# Neighbouring rows of shifts that a work-item sums; the margin holds as many.
-SHIFT_ROWS = 8
-# Largest score of a cell.
-TOP = 255
-
 
 @wp.func
 def padded_lines(scores: ScoreTable):

@@ -2,11 +2,13 @@
 
 import warp as wp
 
+from gpusense.interface.constants import LINE_NUMBERS
+
 from .prelude import kernel
 from .types import real, vec4
 
 # Passes of merging and of moving ends; Gauss-Newton steps of a line; numbers of a line.
-PASSES, STEPS, LINE_NUMBERS = 2, 5, 6
+PASSES, STEPS = 2, 5
 # The triangular root of rows that were added (11, 12, right side 1, 22, right side 2), and the cost.
 rows6 = wp.types.vector(length=6, dtype=real)
 ZERO, ONE, MINUS_ONE = real(0.0), real(1.0), real(-1.0)

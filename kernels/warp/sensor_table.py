@@ -1,8 +1,4 @@
-"""Density of one reading from a table of log p over bins of readings and expected ranges.
-
-Row i is a bin of readings; the last row is for max readings (log probabilities). Column j is a bin of expected ranges;
-the last column is for rays without an obstacle. The table has fewer than 2^31 entries.
-"""
+"""Density of one reading from a table of log p over bins of readings and expected ranges."""
 
 import warp as wp
 

@@ -2,7 +2,9 @@
 
 import warp as wp
 
-from .error_free import BLOCK_TERMS, STRANDS, add_strands, add_term
+from gpusense.interface.constants import BLOCK_TERMS, STRANDS
+
+from .error_free import add_strands, add_term
 from .flags import CUBES, ORDERED, SCANS, STRANDED
 from .prelude import kernel, reader, work_item
 from .types import real, vec2, vec4

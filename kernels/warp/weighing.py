@@ -1,37 +1,20 @@
-"""Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
-
-w_k = v exp(b_k (l - max l)), where v is the previous weight, l the sum over sensors of temperature times log p, and b_k
-= d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
-previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, *Annealed importance
-sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
-
-The depth d is 1. If the last rung leaves too few particles, the host repeats the stage with a smaller d. Recovery:
-augmented MCL, *Probabilistic Robotics* table 8.3, with the mean likelihood per beam.
-"""
+"""Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles."""
 
 import math
 
 import warp as wp
 
+from gpusense.interface import constants as c
+
 from .elementary import exp_of, log_of
 from .prelude import kernel, loader, reader, writer
 
-SHARE, THRESHOLD, SCALE = (wp.constant(place) for place in (19, 20, 21))
-PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED = (wp.constant(place) for place in (22, 23, 24, 25))
-RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
-DEPTH = wp.constant(60)
-# Places in the state: numbers of a stage, then numbers that outlast it.
-LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
-STAGE = wp.constant(8)
-# 2^-(RUNGS - 1).
-LOWEST = wp.constant(wp.float64(0.0078125))
-EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 51))
-LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
-NEVER = wp.constant(wp.float64(-math.inf))
-ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
+LOWEST_RUNG = wp.float64(c.LOWEST)
+LARGEST_EXPONENT = wp.float64(700.0)
+NEVER = wp.float64(-math.inf)
+ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 eight = wp.types.vector(length=8, dtype=wp.float64)
 number_at = reader(wp.float64)
-TEMPERATURE = wp.constant(27)
 load, write = loader(wp.float64), writer(wp.float64)
 sixteen = wp.types.vector(length=16, dtype=wp.float64)
 
@@ -72,7 +55,7 @@ def largest_of(largest: wp.array(dtype=wp.float64), begin: wp.int32, end: wp.int
 def possible_of(totals: wp.array(dtype=wp.float64), largest: wp.float64):
     """Return the largest score; -inf if all particles with a weight are impossible next to particles without."""
     high = NEVER + ZERO
-    if totals[RUNGS - 1] > ZERO:
+    if totals[c.RUNGS - 1] > ZERO:
         high = largest
     return high
 
@@ -82,7 +65,7 @@ def column_of(high: wp.float64, rung: wp.int32):
     """Return the column of sums with the weights of a rung; of the previous weights where none is possible."""
     column = rung
     if wp.isinf(high):
-        column = 2 * RUNGS
+        column = 2 * c.RUNGS
     return column
 
 
@@ -91,9 +74,9 @@ def sum_before(
     sums: wp.array(dtype=wp.float64), joined: wp.array(dtype=wp.float64), b: wp.int32, fan: wp.int32, column: wp.int32
 ):
     """Return the sum of a column over all blocks before one."""
-    total = number_at(sums, b * WEIGHT_SUMS + column)
+    total = number_at(sums, b * c.WEIGHT_SUMS + column)
     if b >= fan:
-        total += number_at(joined, b / fan * WEIGHT_SUMS + column)
+        total += number_at(joined, b / fan * c.WEIGHT_SUMS + column)
     return total
 
 
@@ -103,7 +86,7 @@ def tempered(scores: eight, largest: wp.float64, left: wp.float64):
     found = eight(ONE)
     if not wp.isinf(largest) and left > ZERO:
         for i in range(8):
-            found[i] = exp_of(LOWEST * left * (scores[i] - largest))
+            found[i] = exp_of(LOWEST_RUNG * left * (scores[i] - largest))
     return found
 
 
@@ -112,18 +95,18 @@ def left_of(state: wp.array(dtype=wp.float64), stage: wp.int32):
     """Return the part of the temperature that earlier stages have left."""
     left = ONE
     if stage > 0:
-        left = state[(stage - 1) * STAGE + LEFT]
+        left = state[(stage - 1) * c.STAGE + c.LEFT]
     return left
 
 
 @wp.func
 def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), least: wp.float64):
     """Return the first rung with the effective sample size least, or the last rung."""
-    rung = RUNGS - 1
+    rung = c.RUNGS - 1
     for i in range(7):
         k = 6 - i
         total = number_at(totals, k)
-        if total * total >= least * number_at(settings, SCALE) * number_at(totals, RUNGS + k):
+        if total * total >= least * number_at(settings, c.SCALE) * number_at(totals, c.RUNGS + k):
             rung = k
     return rung
 
@@ -136,19 +119,19 @@ def follow_evidence(
     """Update the averages of the likelihood per beam, and the share of particles to inject."""
     if not wp.isinf(largest) and total > ZERO and before > ZERO:
         evidence = largest + log_of(total / before)
-        mean = exp_of(wp.min(settings[PER_BEAM_SCALE] * evidence, LARGEST_EXPONENT))
+        mean = exp_of(wp.min(settings[c.PER_BEAM_SCALE] * evidence, LARGEST_EXPONENT))
         slow = mean
         fast = mean
-        if state[SLOW] != ZERO:
-            slow = state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW])
-            fast = state[FAST] + settings[FAST_RATE] * (mean - state[FAST])
+        if state[c.SLOW] != ZERO:
+            slow = state[c.SLOW] + settings[c.SLOW_RATE] * (mean - state[c.SLOW])
+            fast = state[c.FAST] + settings[c.FAST_RATE] * (mean - state[c.FAST])
         share = ZERO
         if slow > ZERO:
             share = ONE - fast / slow
-        state[EVIDENCE] = evidence
-        state[SLOW] = slow
-        state[FAST] = fast
-        state[INJECTED] = wp.min(wp.max(share, ZERO), settings[MOST_INJECTED])
+        state[c.EVIDENCE] = evidence
+        state[c.SLOW] = slow
+        state[c.FAST] = fast
+        state[c.INJECTED] = wp.min(wp.max(share, ZERO), settings[c.MOST_INJECTED])
 
 
 @wp.func
@@ -157,23 +140,23 @@ def set_stage(
     high: wp.float64, left: wp.float64, rung: wp.int32, particles: wp.int32, stage: wp.int32, stages: wp.int32,
 ):  # fmt: skip
     """Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature."""
-    if stage == 0 and settings[DEPTH] == ONE:
-        follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
-    size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
-    part = left * settings[DEPTH]
+    if stage == 0 and settings[c.DEPTH] == ONE:
+        follow_evidence(totals[0], totals[2 * c.RUNGS], high, settings, state)
+    size = totals[rung] * totals[rung] / (settings[c.SCALE] * totals[c.RUNGS + rung])
+    part = left * settings[c.DEPTH]
     for _k in range(rung):
         part = part * HALF
     rest = left - part
-    wanted = size < settings[THRESHOLD] * wp.float64(particles) or rest > ZERO
-    if stage == 0 and state[INJECTED] > ZERO:
+    wanted = size < settings[c.THRESHOLD] * wp.float64(particles) or rest > ZERO
+    if stage == 0 and state[c.INJECTED] > ZERO:
         wanted = True
-    first = stage * STAGE
-    state[first + LEFT] = wp.where(stage + 1 < stages, rest, ZERO)
-    state[first + TOTAL] = totals[column_of(high, rung)]
-    state[first + SAMPLE_SIZE] = size
-    state[first + RESAMPLED] = wp.where(wanted, ONE, ZERO)
-    state[first + DEGENERATE] = wp.where(wp.isinf(high), ONE, ZERO)
-    state[first + RUNG] = part
+    first = stage * c.STAGE
+    state[first + c.LEFT] = wp.where(stage + 1 < stages, rest, ZERO)
+    state[first + c.TOTAL] = totals[column_of(high, rung)]
+    state[first + c.SAMPLE_SIZE] = size
+    state[first + c.RESAMPLED] = wp.where(wanted, ONE, ZERO)
+    state[first + c.DEGENERATE] = wp.where(wp.isinf(high), ONE, ZERO)
+    state[first + c.RUNG] = part
 
 
 @kernel
@@ -183,7 +166,7 @@ def add_scores(log_p, settings, score, largest, particles, block, sensor):
     begin = b * block
     if begin >= particles:
         return
-    temperature = settings[TEMPERATURE + sensor]
+    temperature = settings[c.TEMPERATURE + sensor]
     high = wp.float64(0.0) + NEVER
     for n in range(begin, wp.min(begin + block, particles)):
         value = temperature * wp.float64(log_p[n])
@@ -211,8 +194,8 @@ def weigh_particles(score, before, largest, settings, state, sums, highest, part
     if begin >= particles:
         return
     high = largest_of(largest, 0, groups)
-    left = left_of(state, stage) * settings[DEPTH]
-    scale = settings[SCALE]
+    left = left_of(state, stage) * settings[c.DEPTH]
+    scale = settings[c.SCALE]
     end = wp.min(begin + block, particles)
     weights = eight()
     squares = eight()
@@ -230,9 +213,9 @@ def weigh_particles(score, before, largest, settings, state, sums, highest, part
             likelihood = wp.cw_mul(likelihood, likelihood)
         n += 8
     for k in range(8):
-        sums[b * WEIGHT_SUMS + k] = weights[k]
-        sums[b * WEIGHT_SUMS + RUNGS + k] = squares[k]
-    sums[b * WEIGHT_SUMS + 2 * RUNGS] = old
+        sums[b * c.WEIGHT_SUMS + k] = weights[k]
+        sums[b * c.WEIGHT_SUMS + c.RUNGS + k] = squares[k]
+    sums[b * c.WEIGHT_SUMS + 2 * c.RUNGS] = old
     if b == 0:
         highest[0] = high
 
@@ -270,24 +253,24 @@ def set_weights(
     b = wp.tid()
     if b > blocks:
         return
-    scale = settings[SCALE]
+    scale = settings[c.SCALE]
     left = left_of(state, stage)
     high = possible_of(totals, highest[0])
     rung = int(0)
     if left > ZERO:
-        rung = rung_of(totals, settings, settings[SHARE] * wp.float64(particles))
+        rung = rung_of(totals, settings, settings[c.SHARE] * wp.float64(particles))
     if b == blocks:
         set_stage(totals, settings, state, high, left, rung, particles, stage, stages)
         return
     total = sum_before(sums, joined, b, fan, column_of(high, rung))
-    low = left * settings[DEPTH]
+    low = left * settings[c.DEPTH]
     n = b * block
     end = wp.min(n + block, particles)
     while n < end:
         scores = eight_at(score, n, end, NEVER)
         prior = eight_at(before, n, end, ZERO)
         likelihood = tempered(scores, high, low)
-        for _k in range(rung, RUNGS - 1):
+        for _k in range(rung, c.RUNGS - 1):
             likelihood = wp.cw_mul(likelihood, likelihood)
         chosen = wp.cw_mul(prior, likelihood)
         for i in range(8):

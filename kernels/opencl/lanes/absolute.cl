@@ -2,7 +2,7 @@
 // lanes/math.
 // requires: lanes/log_terms
 
-// in lanes: NEARBY SERIES VON_MISES WRAPS WAVES NEGLIGIBLE HALF_TURN HALF_TURN_LOW
+// in lanes: HALF_TURN HALF_TURN_LOW
 
 // The power series of the sine, as in absolute.cl; float32 needs no more terms up to pi / 2.
 #define SINES 7

@@ -2,7 +2,7 @@
 // the order of the scalar kernel.
 // requires: lanes/log_terms
 
-// in lanes: STUDENT_T TWO_NORMALS BEACON STEEPEST
+// in lanes: STEEPEST
 
 // tan(pi/8), pi/4 and pi/2.
 #define EIGHTH_SLOPE 0.414213562f

@@ -1,7 +1,7 @@
 // Sums over a cloud of particles, 8 of them at once: estimate.cl.
 // requires: lanes/motion
 
-// in lanes: ESTIMATE_SUMS RIGHT_ANGLE FAR FAR_TURN add_pose
+// in lanes: RIGHT_ANGLE add_pose
 
 // Return the sum of all lanes, one after the other.
 double sum_in_order(const doubles a) { return ((((((a.s0 + a.s1) + a.s2) + a.s3) + a.s4) + a.s5) + a.s6) + a.s7; }

@@ -2,7 +2,6 @@
 // the working precision: the interpolated distance is continuous, so it changes by no more than the end point's error.
 // requires: lanes/end_point lanes/math lanes/hit_shape
 
-#define GRADIENT_NUMBERS 13
 // Densities whose product is taken before the logarithm (a power of 2), if all are within these bounds.
 #define TOGETHER 4
 #define LEAST_DENSITY 1e-9f

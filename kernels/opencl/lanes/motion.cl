@@ -1,8 +1,7 @@
 // Sampled motions of 8 particles at once: motion.cl.
 // requires: lanes/philox
 
-// in lanes: SEED STEP MEAN DEVIATION REVERSE MOTION_STREAM VELOCITY_MODEL SMALL_ARC WHOLE_TURN FARTHEST_ONCE
-// in lanes: angle_of Motion chord_of wrap_once wrap_any motion_of move_by
+// in lanes: SMALL_ARC WHOLE_TURN FARTHEST_ONCE angle_of Motion chord_of wrap_once wrap_any motion_of move_by
 
 // Move the particles from begin on, at most DOUBLES of them.
 void move_lanes(global const double *source, global const double *settings, global double *target, const int begin,

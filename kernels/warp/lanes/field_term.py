@@ -2,8 +2,9 @@
 
 import warp as wp
 
-from ..end_point import FIELD_RING, EndPoint, end_point
-from ..error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS, FIELD_RING
+
+from ..end_point import EndPoint, end_point
 from ..field_term import field_square, interpolated
 from ..flags import EXACT_EXPONENT, FLOAT64, HIT, LINEAR, RAND
 from ..hit_shape import shape_exponent

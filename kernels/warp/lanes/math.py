@@ -16,30 +16,30 @@ _number = wp.float32
 
 def _numbers(*values):
     """Return constants of float32."""
-    return tuple(wp.constant(_number(value)) for value in values)
+    return tuple(_number(value) for value in values)
 
 
 ZERO, HALF, ONE = _numbers(0.0, 0.5, 1.0)
 # log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
 LOG2_HIGH, LOG2_LOW, ONE_OVER_LOG2 = _numbers(0.693145752, 1.42860677e-06, 1.44269502)
 # 1.5 * 2^23: a sum with it is rounded to a whole number, held in its last bits.
-ROUNDER = wp.constant(_number(12582912.0))
-ROUNDER_BITS = wp.constant(wp.int32(0x4B400000))
+ROUNDER = _number(12582912.0)
+ROUNDER_BITS = wp.int32(0x4B400000)
 # e^EXP_ZERO is close to the smallest normal number; e^EXP_LOST is below half of the last bit of 1.
 EXP_ZERO, EXP_LOST = _numbers(-87.0, -20.0)
-EXPONENT_BIAS, MANTISSA_BITS = wp.constant(wp.int32(127)), wp.constant(wp.int32(23))
-MANTISSA = wp.constant(wp.int32(0x7FFFFF))
+EXPONENT_BIAS, MANTISSA_BITS = wp.int32(127), wp.int32(23)
+MANTISSA = wp.int32(0x7FFFFF)
 # Bits of sqrt(1/2).
-ROOT_HALF = wp.constant(wp.int32(0x3F3504F3))
+ROOT_HALF = wp.int32(0x3F3504F3)
 # From here on the error function is 1 to the last bit.
-ERF_ONE = wp.constant(_number(4.0))
+ERF_ONE = _number(4.0)
 # E, L and W, lowest power first.
 E0, E1, E2, E3, E4 = _numbers(0.49999997, 0.166665465, 0.041667223, 0.00836638454, 0.00138791779)
 L0, L1, L2, L3 = _numbers(0.333333313, -0.250008196, 0.200012267, -0.166233569)
 L4, L5, L6, L7 = _numbers(0.142017633, -0.131601855, 0.127615467, -0.0763445124)
 W0, W1, W2, W3 = _numbers(1.12837923, 0.636619389, 0.102777831, -0.0191530641)
 W4, W5, W6, W7 = _numbers(-0.000160394105, 0.00166702515, -0.000632835436, 0.000117640826)
-W8 = wp.constant(_number(-9.25621225e-06))
+W8 = _number(-9.25621225e-06)
 
 
 @wp.func

@@ -4,7 +4,9 @@ import math
 
 import warp as wp
 
-from ..error_free import BLOCK_TERMS, pair_sum, rest_of, two_product, two_sum
+from gpusense.interface.constants import BLOCK_TERMS
+
+from ..error_free import pair_sum, rest_of, two_product, two_sum
 from ..flags import (
     ALL_READINGS,
     AMCL,

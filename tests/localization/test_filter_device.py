@@ -126,6 +126,19 @@ def test_corrections_of_wide_clouds_refine_the_estimate_that_each_step_asks_for(
     assert not launched and not found.covariance[2, 2] < 0.25
 
 
+def test_a_cloud_that_becomes_wide_needs_no_further_launches(backend, monkeypatch):
+    model, motion = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend), gs.OdometryMotion(least=(0.05, 0.03))
+    pf = gs.ParticleFilter(model, motion=motion, particles=300, seed=5, temperature=0.01, recovery=None)
+    pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.01, 0.01, 1e-3]))
+    launched, deviations, estimates = [], [], pf._cloud._estimates.run
+    monkeypatch.setattr(pf._cloud._estimates, "run", lambda *a: (launched.append(a), estimates(*a)))
+    for _ in range(12):
+        pf.predict((0, 0, 0), (0.0, 0, 0))
+        pf.correct(np.full(60, np.nan))
+        deviations.append(pf.estimate().covariance[2, 2] ** 0.5)
+    assert deviations[0] < 0.06 and deviations[-1] > 0.11 and not launched
+
+
 def test_corrections_compute_the_estimate(backend, monkeypatch):
     ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[3.0, 2.5, 0.4]], SCANNER.bearings)[0]
 

@@ -104,6 +104,18 @@ def test_bounds_and_starts_are_kept() -> None:
     assert fit.parameters.z_short == 0 and fit.parameters.lambda_short == 1.0 and NOTHING < 1
 
 
+@pytest.mark.parametrize("method", ["em", "gradient"])
+def test_short_readings_that_are_uniform_end_at_the_lower_bound(method: str) -> None:
+    """Rounding may leave the rate of the gradient's search an ulp above the bound."""
+    for seed in (1, 5):
+        rng = np.random.default_rng(seed)
+        expected = rng.uniform(3, 9, 400)
+        z, short = expected + rng.normal(0, 0.05, 400), rng.random(400) < 0.2
+        z[short] = rng.uniform(0, 1, short.sum()) * expected[short]
+        fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, method=method, backend="numpy")
+        assert fit.converged and fit.held["lambda_short"] == "at its lower bound 0.0001"
+
+
 BAD = {
     "ranges: must hold a reading": dict(ranges=[np.nan, -1.0]),
     "expected: shape must be that of ranges": dict(expected=[1.0]),

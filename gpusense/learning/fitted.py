@@ -18,8 +18,8 @@ from gpusense.world.parameters import BeamParameters, LandmarkParameters
 
 P = TypeVar("P")
 _UNITS = {
-    "sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m", "sigma_range": "m", "sigma_bearing": "rad",
-    "bearing_bias": "rad",
+    "sigma_hit": "m", "lambda_short": "1/m", "lambda_rand": "1/m", "range_bias": "m", "sigma_range": "m",
+    "sigma_bearing": "rad", "bearing_bias": "rad",
 }  # fmt: skip
 
 

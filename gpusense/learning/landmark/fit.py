@@ -246,20 +246,22 @@ def _report(
         known = pairs.measured[part] and value.responsibility.sum() > _NOTHING
         offset = values[name] if problem.fit_bias else _mean(pairs, value, part)
         offsets |= {name: offset if known else math.nan, f"{name}_error": offset_errors[name] if known else math.nan}
-        del errors[name]
+        if errors.pop(name) == math.inf:
+            held[name] = "the readings do not determine it"
     expected, detected = counts or (0, 0.0)
     false = np.full(sightings.total, np.nan)
     false[sightings.indices] = value.false
     sigmas: dict[str, Any] = {name: values[name] if pairs.present[k] else None for k, name in enumerate(SIGMAS)}
     span = pairs.limits.span if pairs.present[SIGNATURE] else base.signature_span
     weights = {name: values[name] for name in ("z_detect", "z_false")}
+    fields = common_fields(
+        end.value, end.trace, end.converged, errors, held, _notes(pairs, value, end.converged),
+        sightings.total - len(value.false),
+    )  # fmt: skip
+    fields["held"] |= {name: "no feature has this part" for name in SIGMAS if sigmas[name] is None}
     return LandmarkFit(
         parameters=replace(base, **sigmas, **weights, p_detect=p_detect, signature_span=span),
-        **common_fields(
-            end.value, end.trace, end.converged, errors, held, _notes(pairs, value, end.converged),
-            sightings.total - len(value.false),
-        ),
-        **offsets, bias_fitted=problem.fit_bias, features=len(value.false),
+        **fields, **offsets, bias_fitted=problem.fit_bias, features=len(value.false),
         false_positives=float(value.false.sum()), expected=expected, detected=detected, false=false,
     )  # fmt: skip
 
@@ -288,8 +290,8 @@ def _held(pairs: Pairs, values: dict[str, float], value: Value) -> dict[str, str
     for k, name in enumerate(SIGMAS):
         sigma = values[name]
         if not pairs.present[k]:
-            held[name] = "no feature has this part"
-        elif not detections:
+            continue
+        if not detections:
             held[name] = "kept, since no feature is a landmark"
         elif not pairs.measured[k]:
             held[name] = "kept, since no landmark has this part"

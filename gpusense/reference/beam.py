@@ -3,14 +3,15 @@
 import numpy as np
 
 from gpusense.interface import structs
+from gpusense.reference.crowd import meet_shapes
 from gpusense.reference.echo import echoes, incidence_terms
 from gpusense.reference.error_free import add_term, strand_sums, strands_in
 from gpusense.reference.mixture import compat_density, last_range, log_density
 from gpusense.reference.ranges import cast_ranges
 from gpusense.reference.ray import expected_range
 from gpusense.reference.sensor_table import tabulated_density
+from gpusense.reference.shapes import DIRECTIONS
 from gpusense.reference.sums import particles_of_scans
-from gpusense.reference.worlds import meet_shapes
 
 
 def ray_limit(flags, z, terms, scale):
@@ -30,9 +31,9 @@ def cast_beam(flags, map_table, normals, pose_cell, pose, ray, rays, window, con
         return expected_range(flags, t, scale), cosine
     ranges = np.empty(len(pose) * rays, pose.dtype)
     if "SHAPES" in flags:
-        none = np.empty(0, np.int32)
+        turns = np.r_[np.zeros(DIRECTIONS + 1, int), :rays]
         meet_shapes(
-            flags, shapes, world, pose_cell, pose, ray, none, ranges, len(pose), rays, scale.limit, crowd
+            flags, shapes, world, pose_cell, pose, ray, turns, ranges, len(pose), rays, scale.limit, crowd
         )  # fmt: skip
     cast_ranges(
         flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale, crowd

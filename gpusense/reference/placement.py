@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.heading import cos_sin
 
 # Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
@@ -59,6 +60,17 @@ def place_pose(flags, poses, pose_cell, pose, pose_low, pose_status, frame, wind
         pose[:, column] = rounded[column]
         if "TWO_PART_POINTS" in flags:
             pose_low[:, column] = exact[column] - rounded[column]
+
+
+# Numbers of a world's frame: x and y of its origin, cosine and sine of its yaw, rows, columns, its first cell, and one
+# that is not used.
+FRAME_NUMBERS = 8
+
+
+def frame_in(frames: np.ndarray, index: int, frame: structs.Frame) -> structs.Frame:
+    """Return the frame of a world; all worlds share the scanner's position and the resolution."""
+    x, y, cosine, sine = frames[index * FRAME_NUMBERS : index * FRAME_NUMBERS + 4].tolist()
+    return frame._replace(origin_x=x, origin_y=y, yaw_cos=cosine, yaw_sin=sine)
 
 
 def place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):

@@ -5,9 +5,10 @@ import importlib
 import numpy as np
 
 from gpusense.interface.casters import caster_file
+from gpusense.reference.crowd import meet_shapes
 from gpusense.reference.ray import expected_range
 from gpusense.reference.raycast import sectors_of
-from gpusense.reference.shapes import particles_of_worlds, world_begin, world_window
+from gpusense.reference.shapes import DIRECTIONS, particles_of_worlds, world_begin, world_window
 
 BLOCK = 1 << 15
 
@@ -53,4 +54,17 @@ def cast_tiles(
     """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
     cast_ranges(
         flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd
+    )
+
+
+def cast_among_shapes(
+    flags, map_table, world, shapes, pose_cell, pose, ray, turns, ranges, particles, rays, caster, scale, crowd, each
+):  # fmt: skip
+    """Cast rays, which ``ray`` has in the order at the end of ``turns``, among moving shapes."""
+    meet_shapes(flags, shapes, world, pose_cell, pose, ray, turns, ranges, particles, rays, scale.limit, crowd)
+    beams = np.empty_like(ray[:rays])
+    beams[turns[DIRECTIONS + 1 : DIRECTIONS + 1 + rays]] = ray[:rays]
+    window = world_window(world, 0)
+    cast_ranges(
+        flags, map_table, world, shapes, pose_cell, pose, beams, ranges, window, particles, rays, caster, scale, crowd
     )

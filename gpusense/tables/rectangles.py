@@ -169,6 +169,7 @@ def _make(
     tall = _TALL
     while tall < height and -(-height // (2 * tall)) * sectors * 4 * worlds * width >= _ENOUGH:
         tall *= 2
-    size = (width, -(-height // tall) * sectors, 4 * worlds)
+    # Tiles begin at multiples of four rows of a padded plane, and the last has up to twice as many.
+    size = (width, max((height + 3) // tall, 1) * sectors, 4 * worlds)
     scan = backend.compile("rectangles_scan", _NO_FLAGS)
     scan(size, runs, place, rectangles, *changed_part, worlds, planes.lines(rows), planes.group, tall)

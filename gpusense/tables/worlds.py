@@ -105,8 +105,9 @@ class Worlds:
         self.frames = self.backend.upload(frames_of(self._origins, self._resolution, self._sizes, self._place))
         self.crowd = CrowdTable(self.backend, self.frames, self._resolution, count)
         self._put(np.arange(count), given)
-        sizes = self._sizes
-        self.uniform = bool((sizes == sizes[0]).all() and all(pose == self._origins[0] for pose in self._origins))
+        # Worlds of one size are of one kind.
+        self._kind = np.unique(self._sizes, axis=0, return_inverse=True)[1].reshape(-1)
+        self.uniform = not self._kind.any() and all(pose == self._origins[0] for pose in self._origins)
 
     def __len__(self) -> int:
         return len(self._sizes)
@@ -164,7 +165,7 @@ class Worlds:
 
     def __repr__(self) -> str:
         rows, cols = self.shape
-        size = f"{rows} x {cols}" if (self._sizes == self._sizes[0]).all() else f"up to {rows} x {cols}"
+        size = f"up to {rows} x {cols}" if self._kind.any() else f"{rows} x {cols}"
         shapes = "" if self.shapes.worlds is None else f", shapes={self.shapes}"
         power = min(max(len(str(self.nbytes)) - 1, 0) // 3, 3)
         memory = f"{self.nbytes / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"
@@ -316,9 +317,10 @@ class Worlds:
 
     def stacks(self, indices: np.ndarray) -> Iterator[Stack]:
         """Yield stacks of worlds of one size, of as many cells as are made at once."""
-        sizes = self._sizes[indices]
-        for rows, cols in sorted(set(map(tuple, sizes.tolist()))):
-            members = indices[(sizes == (rows, cols)).all(axis=1)]
+        kinds = self._kind[indices]
+        for kind in np.unique(kinds).tolist():
+            members = indices[kinds == kind]
+            rows, cols = self._sizes[members[0]].tolist()
             each = max(_TOGETHER[self.backend.info.kind] // (rows * cols), 1)
             for first in range(0, len(members), each):
                 part = members[first : first + each]

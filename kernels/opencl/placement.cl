@@ -83,6 +83,19 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
 #endif
 }
 
+// Numbers of a world's frame: x and y of its origin, cosine and sine of its yaw, rows, columns, its first cell, and one
+// that is not used.
+#define FRAME_NUMBERS 8
+
+// Return the frame of a world; all worlds share the scanner's position and the resolution.
+Frame frame_in(global const double *frames, const int index, const Frame frame) {
+    global const double *numbers = frames + (long)index * FRAME_NUMBERS;
+    Frame moved = frame;
+    moved.origin_x = numbers[0], moved.origin_y = numbers[1];
+    moved.yaw_cos = numbers[2], moved.yaw_sin = numbers[3];
+    return moved;
+}
+
 // Place poses: one work-item takes a particle.
 kernel void place_poses(ARGUMENTS) {
     const int particle = get_global_id(0);

@@ -106,7 +106,8 @@ kernel void free_rows(ARGUMENTS) {
 }
 
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of
-// tall cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
+// tall cells of a column in a quadrant, from the far end on, and writes four at once; the last one takes the remaining
+// cells, too. Ends of tiles and fours are multiples of four rows of the padded plane. height and width are the sides of the highest rectangle of
 // sufficient width, narrower is the width of a rectangle that is one row higher, and bound is the number of rows to the
 // nearest row with this width; wider and nearer are the same of the rows before that one, wider is -1 where they are
 // unknown. From one cell to the next the height grows by one at most, and its rows without the new row allow every
@@ -115,61 +116,68 @@ kernel void rectangles_scan(ARGUMENTS) {
     const int quadrant = get_global_id(2) & 3, w = get_global_id(2) >> 2;
     const int dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
     const int sector = get_global_id(1) % sectors, tile = get_global_id(1) / sectors;
-    const int col = reach_begin(dx, left) + get_global_id(0), begin = reach_begin(dy, top) + tall * tile;
-    const int end = min(begin + tall, reach_end(dy, bottom, rows));
-    if (col >= reach_end(dx, right, cols) || w >= worlds || begin >= end) return;
+    const int col = reach_begin(dx, left) + get_global_id(0);
+    // Rows of the padded plane.
+    const int from = reach_begin(dy, top) + 1, until = reach_end(dy, bottom, rows) + 1;
+    const int tiles = max((until - (from & ~3)) / tall, 1), corner = (from & ~3) + tall * tile;
+    const int begin = max(corner, from), end = tile == tiles - 1 ? until : corner + tall;
+    if (col >= reach_end(dx, right, cols) || w >= worlds || tile >= tiles) return;
     global ushort *out = rectangles + (long)place[w] * 4 * sectors;
     out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
     const int2 middle = slope(sectors, sector);
     const long step = dy * (long)worlds * cols;
-    // x * inverse >> 16 is x / middle.y for x up to 4000.
-    const int inverse = 65536 / middle.y + 1;
-    int height = 0, width = LONGEST, narrower = 0, bound = 0, wider = LONGEST, nearer = 0, filled = 0;
-    int row = dy > 0 ? end - 1 : begin, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
-    global const uchar *run = runs + (((long)(quadrant & 1) * band + row - first) * worlds + w) * cols + col;
-    ulong four = 0;
+    // x * inverse >> 16 is x * middle.x / middle.y for x up to LONGEST.
+    const int inverse = middle.x * (65536 / middle.y + 1);
+    // Begin at the row before the tile, whose rectangle may have a row less: the next one may have a row more.
+    const int before = dy > 0 ? end : begin - 1;
+    int height = 0, width = LONGEST, narrower = 0, bound = 0, wider = LONGEST, nearer = 0;
+    int room = min(dy > 0 ? rows + 1 - before : before, LONGEST - 1);
+    long at = (((long)(quadrant & 1) * band + before - 1 - first) * worlds + w) * cols + col;
     for (;;) {
-        narrower = height < room ? min(width, (int)run[height * step]) : 0;
+        narrower = height < room ? min(width, (int)runs[at + height * step]) : 0;
         if (narrower * middle.x < (height + 1) * middle.y) break;
         if (narrower < width) wider = width, nearer = bound, bound = height;
         width = narrower;
         ++height;
     }
-    for (int remaining = end - begin - 1; remaining >= 0; --remaining) {
-        const int best = narrower * middle.x > height * middle.y;
-        const int sides = best ? narrower + 256 * (height + 1) : height > 0 ? width + 256 * height : OCCUPIED;
-        const int part = (row + 1) & 3;
-        if (group == 1) {
-            out[padded(row, col, cols)] = (ushort)sides;
-        } else {
-            // A write of four rows takes no longer than a write of one.
-            four |= (ulong)sides << 16 * part;
-            ++filled;
-            if (part == (dy > 0 ? 0 : 3) || remaining == 0) {
-                global ushort *to = out + padded_in_groups(row, col, cols, group) - part;
-                if (filled == 4) *(global ulong *)to = four;
-                for (int k = part; filled < 4 && filled > 0; --filled, k += dy) to[k] = (ushort)(four >> 16 * k);
-                four = 0;
-                filled = 0;
-            }
-        }
-        if (remaining == 0) return;
-        row -= dy, run -= step, room = min(room + 1, LONGEST);
-        const int here = run[0], least = min(here, width);
+    // Rows of a write, less one: a write of four takes no longer than a write of one.
+    const int others = group > 1 ? 3 : 0, edge = dy > 0 ? 0 : others, last = dy > 0 ? begin : end - 1;
+    ulong four = 0;
+    at -= step;
+    int next = runs[at];
+    for (int row = dy > 0 ? end - 1 : begin;; row -= dy, at -= step) {
+        const int here = next, least = min(here, width);
+        if (row != last) next = runs[at - step];
+        room = min(room + 1, LONGEST);
         const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
         bound = here <= width ? 0 : bound + 1;
         nearer = here <= wider ? 0 : nearer + 1;
         wider = here <= width ? LONGEST : min(here, wider);
-        height = higher ? height + 1 : min(height, here * middle.x * inverse >> 16);
+        height = higher ? height + 1 : min(height, here * inverse >> 16);
         narrower = height == room ? 0 : higher ? min(here, narrower) : least;
         width = height > 0 ? least : LONGEST;
-        if (height == 0 || bound < height) continue;
-        width = wider, bound = nearer, wider = -1;
-        if (width >= 0 && bound < height) continue;
-        width = LONGEST, bound = 0, wider = LONGEST;
-        for (int j = 0; j < height; ++j) {
-            const int other = run[j * step];
-            if (other < width) wider = width, nearer = bound, width = other, bound = j;
+        if (height > 0 && bound >= height) {
+            width = wider, bound = nearer, wider = -1;
+            if (width < 0 || bound >= height) {
+                width = LONGEST, bound = 0, wider = LONGEST;
+                for (int j = 0; j < height; ++j) {
+                    const int other = runs[at + j * step];
+                    if (other < width) wider = width, nearer = bound, width = other, bound = j;
+                }
+            }
         }
+        const int best = narrower * middle.x > height * middle.y;
+        four = four << 16 | (uint)(best ? narrower + 256 * (height + 1) : height > 0 ? width + 256 * height : OCCUPIED);
+        if ((row & others) != edge && row != last) continue;
+        const int lowest = row & ~others, highest = lowest + others;
+        if (others > 0 && lowest >= begin && highest < end) {
+            *(global ulong *)(out + padded_in_groups(lowest - 1, col, cols, group)) =
+                dy > 0 ? four : as_ulong(as_ushort4(four).wzyx);
+        } else {
+            const int oldest = dy > 0 ? min(highest, end - 1) : max(lowest, begin);
+            for (int k = row; (oldest - k) * dy >= 0; k += dy, four >>= 16)
+                out[padded_in_groups(k - 1, col, cols, group)] = (ushort)four;
+        }
+        if (row == last) return;
     }
 }

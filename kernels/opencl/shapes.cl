@@ -79,6 +79,18 @@ real2 directions_of(global const real *shapes, global const int2 *world, const C
                                  heading.x * end_y - heading.y * end_x);
 }
 
+// Return the rays that a shape covers: the place of the first among the rays in order, and their number; the first ray
+// follows the last. turns has the first place of each of DIRECTIONS ranges of directions relative to the heading, the
+// number of rays, and the rays in order.
+int2 covered_rays(global const real *shapes, global const int2 *world, const Crowd crowd, const int n, const int i,
+                  const int2 cell, const real4 pose, global const int *turns, const int rays) {
+    const real2 seen = directions_of(shapes, world, crowd, n, i, cell, pose, pose.zw);
+    const int low = (int)floor(seen.x * (DIRECTIONS / 4)), high = (int)floor(seen.y * (DIRECTIONS / 4));
+    const int from = low & (DIRECTIONS - 1), to = from + high - low, begin = turns[from];
+    const int end = turns[(to & (DIRECTIONS - 1)) + 1] + (to >= DIRECTIONS ? rays : 0);
+    return (int2)(begin, high < low ? 0 : end - begin);
+}
+
 // Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of directions.
 int sight_at(const Crowd crowd, const int n, const int sight) {
     return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs;

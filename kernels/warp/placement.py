@@ -77,6 +77,26 @@ def place_pose(
         )
 
 
+# Numbers of a world's frame: x and y of its origin, cosine and sine of its yaw, rows, columns, its first cell, and one
+# that is not used.
+FRAME_NUMBERS = wp.constant(8)
+
+
+@wp.func
+def frame_in(frames: wp.array(dtype=wp.float64), index: wp.int32, frame: Frame):
+    """Return the frame of a world; all worlds share the scanner's position and the resolution."""
+    first = index * FRAME_NUMBERS
+    moved = Frame()
+    moved.origin_x = frames[first]
+    moved.origin_y = frames[first + 1]
+    moved.resolution = frame.resolution
+    moved.mount_x = frame.mount_x
+    moved.mount_y = frame.mount_y
+    moved.yaw_cos = frames[first + 2]
+    moved.yaw_sin = frames[first + 3]
+    return moved
+
+
 @kernel
 def place_poses(poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):
     """Place poses: one work-item takes a particle."""

@@ -16,8 +16,12 @@ behind_of, run_at = behind(wp.uint16), reader(wp.uint8)
 put, put_run = writer(wp.uint16), writer(wp.uint8)
 
 
-@wp.func_native("*reinterpret_cast<unsigned long long *>(values.data + i) = four;")
-def put_four(values: wp.array(dtype=wp.uint16), i: wp.int32, four: wp.uint64): ...
+# Write four rows, the last first, or in this order where the direction is below 0.
+@wp.func_native("""
+if (dy < 0) four = four << 48 | (four << 16 & 0xffff00000000) | (four >> 16 & 0xffff0000) | four >> 48;
+*reinterpret_cast<unsigned long long *>(values.data + i) = four;
+""")
+def put_four(values: wp.array(dtype=wp.uint16), i: wp.int32, four: wp.uint64, dy: wp.int32): ...
 
 
 @wp.func
@@ -172,31 +176,33 @@ def rectangles_scan(
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
     sector = tile_item % sectors
+    tile = tile_item // sectors
     col = reach_begin(dx, left) + col_item
-    begin = reach_begin(dy, top) + tall * (tile_item // sectors)
-    end = wp.min(begin + tall, reach_end(dy, bottom, rows))
-    if col >= reach_end(dx, right, cols) or w >= worlds or begin >= end:
+    # Rows of the padded plane.
+    since = reach_begin(dy, top) + 1
+    until = reach_end(dy, bottom, rows) + 1
+    tiles = wp.max((until - (since & ~3)) // tall, 1)
+    corner = (since & ~3) + tall * tile
+    begin = wp.max(corner, since)
+    end = wp.where(tile == tiles - 1, until, corner + tall)
+    if col >= reach_end(dx, right, cols) or w >= worlds or tile >= tiles:
         return
     planes = behind_of(rectangles, wp.int64(place[w]) * wp.int64(4 * sectors))
     out = (quadrant * sectors + sector) * lines * (cols + 2)
     middle = slope(sectors, sector)
     step = dy * worlds * cols
-    # x * inverse >> 16 is x / middle[1] for x up to 4000.
-    inverse = 65536 // middle[1] + 1
+    # x * inverse >> 16 is x * middle[0] / middle[1] for x up to LONGEST.
+    inverse = middle[0] * (65536 // middle[1] + 1)
+    # Begin at the row before the tile, whose rectangle may have a row less: the next one may have a row more.
+    before = wp.where(dy > 0, end, begin - 1)
+    room = wp.min(wp.where(dy > 0, rows + 1 - before, before), LONGEST - 1)
+    run = (((quadrant & 1) * band + before - 1 - first) * worlds + w) * cols + col
     height = int(0)
     width = int(LONGEST)
     narrower = int(0)
     bound = int(0)
     wider = int(LONGEST)
     nearer = int(0)
-    four = wp.uint64(0)
-    filled = int(0)
-    row = int(begin)
-    room = wp.min(begin + 1, LONGEST)
-    if dy > 0:
-        row = end - 1
-        room = wp.min(rows - row, LONGEST)
-    run = (((quadrant & 1) * band + row - first) * worlds + w) * cols + col
     fits = bool(True)
     while fits:
         narrower = int(0)
@@ -210,45 +216,28 @@ def rectangles_scan(
                 bound = height
             width = narrower
             height += 1
+    # Rows of a write, less one: a write of four takes no longer than a write of one.
+    others = wp.where(group > 1, 3, 0)
+    edge = wp.where(dy > 0, 0, others)
+    four = wp.uint64(0)
+    run -= step
+    following = int(run_at(runs, run))
+    row = wp.where(dy > 0, end - 1, begin)
     remaining = end - begin
     while remaining > 0:
+        here = following
         remaining -= 1
-        sides = wp.where(height > 0, width + 256 * height, OCCUPIED)
-        if narrower * middle[0] > height * middle[1]:
-            sides = narrower + 256 * (height + 1)
-        if group == 1:
-            put(planes, out + padded(row, col, cols), wp.uint16(sides))
-        else:
-            # A write of four rows takes no longer than a write of one.
-            part = (row + 1) & 3
-            four = four | (wp.uint64(sides) << wp.uint64(16 * part))
-            filled += 1
-            if part == wp.where(dy > 0, 0, 3) or remaining == 0:
-                to = out + padded_in_groups(row, col, cols, group) - part
-                if filled == 4:
-                    put_four(planes, to, four)
-                else:
-                    for k in range(filled):
-                        place_in_four = part + dy * k
-                        one = (four >> wp.uint64(16 * place_in_four)) & wp.uint64(65535)
-                        put(planes, to + place_in_four, wp.uint16(one))
-                four = wp.uint64(0)
-                filled = int(0)
-        if remaining == 0:
-            return
-        row -= dy
-        run -= step
-        room = wp.min(room + 1, LONGEST)
-        here = int(run_at(runs, run))
+        if remaining > 0:
+            following = int(run_at(runs, run - step))
         least = wp.min(here, width)
+        room = wp.min(room + 1, LONGEST)
         higher = height < room and least * middle[0] >= (height + 1) * middle[1]
         bound = wp.where(here <= width, 0, bound + 1)
         nearer = wp.where(here <= wider, 0, nearer + 1)
         wider = wp.where(here <= width, LONGEST, wp.min(here, wider))
         narrower = wp.where(higher, wp.min(here, narrower), least)
-        height = wp.where(higher, height + 1, wp.min(height, (here * middle[0] * inverse) >> 16))
-        if height == room:
-            narrower = int(0)
+        height = wp.where(higher, height + 1, wp.min(height, (here * inverse) >> 16))
+        narrower = wp.where(height == room, 0, narrower)
         width = wp.where(height > 0, least, LONGEST)
         if height > 0 and bound >= height:
             width = wider
@@ -265,3 +254,21 @@ def rectangles_scan(
                         nearer = bound
                         width = other
                         bound = j
+        sides = wp.where(height > 0, width + 256 * height, OCCUPIED)
+        if narrower * middle[0] > height * middle[1]:
+            sides = narrower + 256 * (height + 1)
+        four = (four << wp.uint64(16)) | wp.uint64(wp.uint32(sides))
+        if (row & others) == edge or remaining == 0:
+            lowest = row & ~others
+            highest = lowest + others
+            if others > 0 and lowest >= begin and highest < end:
+                put_four(planes, out + padded_in_groups(lowest - 1, col, cols, group), four, dy)
+            else:
+                k = int(row)
+                oldest = wp.where(dy > 0, wp.min(highest, end - 1), wp.max(lowest, begin))
+                while (oldest - k) * dy >= 0:
+                    put(planes, out + padded_in_groups(k - 1, col, cols, group), wp.uint16(four & wp.uint64(65535)))
+                    four = four >> wp.uint64(16)
+                    k += dy
+        row -= dy
+        run -= step

@@ -125,6 +125,29 @@ def directions_of(
     )
 
 
+turn_at = reader(wp.int32)
+EACH = real(DIRECTIONS / 4)
+
+
+@wp.func
+def covered_rays(
+    shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, i: wp.int32,
+    cell: wp.vec2i, pose: vec4, turns: wp.array(dtype=wp.int32), rays: wp.int32,
+):  # fmt: skip
+    """Return the rays that a shape covers: the place of the first among the rays in order, and their number; the first
+    ray follows the last. turns has the first place of each of DIRECTIONS ranges of directions relative to the heading,
+    the number of rays, and the rays in order.
+    """
+    seen = directions_of(shapes, world, crowd, n, i, cell, pose, vec2(pose.z, pose.w))
+    low = int(wp.floor(seen.x * EACH))
+    high = int(wp.floor(seen.y * EACH))
+    since = low & (DIRECTIONS - 1)
+    to = since + high - low
+    begin = turn_at(turns, since)
+    end = turn_at(turns, (to & (DIRECTIONS - 1)) + 1) + wp.where(to >= DIRECTIONS, rays, 0)
+    return wp.vec2i(begin, wp.where(high < low, 0, end - begin))
+
+
 @wp.func
 def sight_at(crowd: Crowd, n: wp.int32, sight: wp.int32):
     """Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of

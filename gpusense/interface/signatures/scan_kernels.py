@@ -79,6 +79,10 @@ KERNELS: dict[str, Kernel] = {
         "out real ranges [particles * rays]", WINDOW, "int particles", "int rays", *_CASTING, "int spread",
         apart=True,
     ),
+    "cast_among_shapes": kernel(
+        "ranges", "item", *_CAST, *POSES, "real2 ray [rays]", "int turns [4097 + rays]",
+        "out real ranges [particles * rays]", "int particles", "int rays", *_CASTING, "int each", apart=True, team=64,
+    ),
     "beam_tiles": kernel(
         "beam", "item", *_CAST, *_NORMALS, *POSES, _ORDER, _CONES, _FIRST, "real reading [readings]", *_TERMS,
         _START, "out real parts [readings * particles]", WINDOW,
@@ -199,16 +203,16 @@ KERNELS: dict[str, Kernel] = {
         "int wide", "int wide_ignore", "Crowd crowd",
     ),
     "find_sights": kernel(
-        "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES,
+        "crowd", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES,
         "out int sights [2 * crowd.begin]", "int particles", "Crowd crowd",
     ),
     "meet_shapes": kernel(
-        "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES, "real2 ray [rays]",
+        "crowd", "particle", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES, "real2 ray [rays]",
         "int turns [4097 + rays]", "out real ranges [particles * rays]", "int particles", "int rays", "real limit",
-        "Crowd crowd", team=64,
+        "Crowd crowd",
     ),
     "place_shapes": kernel(
-        "worlds", "shape world", "coordinate raw [worlds * count * numbers]", _FRAMES,
+        "crowd", "shape world", "coordinate raw [worlds * count * numbers]", _FRAMES,
         "out real shapes [worlds * stride]",
         "Frame frame", "int count", "int numbers", "int begin", "int stride", "int worlds",
     ),

@@ -84,15 +84,17 @@ def require_exact(argument: str, method: Caster) -> None:
 
 
 LASER = Cones()
-# Most rays of a pose for which work-items find shapes together; the kernel file ``worlds`` has the same number.
-_MOST_RAYS_OF_TEAM = 2048
+# Most rays of a team of work-items, as in the kernel file ``ranges``, number of teams that fill any GPU, and
+# most teams of a launch.
+_RAYS_OF_TEAM, _ENOUGH_TEAMS, _MOST_TEAMS = 512, 4096, (1 << 25) - 1
 
 
 class Rays(NamedTuple):
     """Rays on a device."""
 
     vectors: Buffer  # their vectors
-    turns: Buffer | None  # their order by direction, see ``turns_of``; None in a single map
+    turns: Buffer | None = None  # their order by direction, see ``turns_of``; None in a single map
+    ordered: Buffer | None = None  # their vectors in this order
 
 
 class MapCaster:
@@ -250,10 +252,12 @@ class MapCaster:
     def rays(self, vectors: np.ndarray, space: Workspace) -> Rays:
         """Return ray vectors on the device, copied where the last call had others."""
         key = vectors.shape, vectors.tobytes()
-        ray, turns = space.hold("ray", key, lambda: vectors.astype(self.real)), None
-        if self._worlds is not None:
-            turns = space.hold("turns", key, lambda: turns_of(vectors.astype(self.real).reshape(-1, 2)))
-        return Rays(ray, turns)
+        ray = space.hold("ray", key, lambda: vectors.astype(self.real))
+        if self._worlds is None:
+            return Rays(ray)
+        flat = functools.cache(lambda: vectors.astype(self.real).reshape(-1, 2))
+        turns = space.hold("turns", key, lambda: turns_of(flat()))
+        return Rays(ray, turns, space.hold("ordered", key, lambda: flat()[turns_of(flat())[-len(flat()) :]]))
 
     def draw(self, poses: Poses, vectors: np.ndarray, flat: Any, cones: Cones, drawing: Drawing) -> None:
         """Draw readings at S N poses into flat memory, in pieces that fit the device's memory.
@@ -351,7 +355,11 @@ class MapCaster:
             heard = dict(normals=results["normals"], incidence=results["incidence"], cone=cones.struct)
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         flags -= {"COSINES"}
-        shapes = self._meet_shapes(placed, ray, rays, flags, ranges)
+        shapes: Program = ()
+        if "SHAPES" in flags:
+            shapes, ended = self._meet_shapes(placed, ray, rays, flags, common)
+            if ended:
+                return shapes
         if self.backend.info.kind == "gpu" and not (self._worlds is not None and rays >= tiles.LEAST_OF_ONE_POSE):
             flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles.tiles_of(count, rays)
@@ -366,19 +374,24 @@ class MapCaster:
         return *shapes, launch("cast_ranges", flags, (rays, count), **common)
 
     def _meet_shapes(
-        self, placed: PlacedPoses, ray: Rays, rays: int, flags: frozenset[str], ranges: Buffer
-    ) -> Program:  # fmt: skip
-        """Return the launch that leaves the distances of moving shapes in place of ranges; none without shapes."""
-        if "SHAPES" not in flags:
-            return ()
-        info, flags = self.backend.info, flags & {"SHAPES", "FLOAT64"}
-        # Teams keep as many numbers of 32 bits.
-        kind = "cpu" if "FLOAT64" in flags or rays > _MOST_RAYS_OF_TEAM else info.kind
-        flags, team = with_teams_flags(kind, "meet_shapes", flags, 1 << 30, self.backend.largest_group)
-        return (
-            launch(
-                "meet_shapes", flags, (placed.count * team,), **placed.places(), pose_cell=placed.cell,
-                pose=placed.pose, ray=ray.vectors, turns=ray.turns, ranges=ranges, particles=placed.count, rays=rays,
-                limit=self.limit,
-            ),
-        )  # fmt: skip
+        self, placed: PlacedPoses, ray: Rays, rays: int, flags: frozenset[str], common: dict[str, Any]
+    ) -> tuple[Program, bool]:
+        """Return the launch that leaves the distances of moving shapes in place of ranges, or the launch of teams that
+        also casts the rays, and whether it does.
+        """
+        count, info = placed.count, self.backend.info
+        parts = -(-rays // _RAYS_OF_TEAM)
+        while count * parts < _ENOUGH_TEAMS and 64 * parts < rays:
+            parts *= 2
+        each = -(-rays // (64 * parts)) * 64
+        items = count * -(-rays // each)
+        kind = "cpu" if "FLOAT64" in flags or items > _MOST_TEAMS else info.kind
+        teams, team = with_teams_flags(kind, "cast_among_shapes", flags, 1 << 30, self.backend.largest_group)
+        arguments = {name: value for name, value in common.items() if name not in ("window", "ray")}
+        arguments |= dict(ray=ray.ordered, turns=ray.turns)
+        if team > 1:
+            return (launch("cast_among_shapes", teams, (items * team,), **arguments, each=each),), True
+        for name in ("map_table", "caster", "scale"):
+            del arguments[name]
+        flags &= {"SHAPES", "FLOAT64"}
+        return (launch("meet_shapes", flags, (count,), **arguments, limit=self.limit),), False

@@ -56,10 +56,10 @@ def directions_of(
     one = index.astype(np.int64) * crowd.stride + DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
     x, y = ((shapes[one + k] - cell[:, k].astype(real)) - pose[:, k] for k in range(2))
     if i < crowd.discs + crowd.boxes:
-        sine = shapes[one + (2 if i < crowd.discs else 6)] / np.sqrt(x * x + y * y) + real(1e-5)
-        cosine = np.sqrt((1 - sine) * (1 + sine))
-        low = x * cosine + y * sine, y * cosine - x * sine
-        high, around = (x * cosine - y * sine, y * cosine + x * sine), ~(sine < real(0.99))
+        radius, square = shapes[one + (2 if i < crowd.discs else 6)], x * x + y * y
+        away = np.sqrt(square - radius * radius)
+        low, high = (x * away + y * radius, y * away - x * radius), (x * away - y * radius, y * away + x * radius)
+        around = ~(radius * radius < real(0.98) * square - real(1e-30))
     else:
         end_x, end_y = ((shapes[one + 2 + k] - cell[:, k].astype(real)) - pose[:, k] for k in range(2))
         turn, along = x * end_y - y * end_x, x * end_x + y * end_y

@@ -13,7 +13,11 @@ kernel void find_sights(ARGUMENTS) {
     const int item = get_global_id(0), count = crowd.discs + crowd.boxes + crowd.segments;
     const int n = item / count, i = item % count;
     if (n >= particles) return;
-    const real2 seen = directions_of(shapes, world, crowd, n, i, pose_cell[n], pose[n], (real2)(1, 0)) * (SIGHTS / 4);
+    const int2 place = world[2 * n + 1];
+    if (i == place.y) return;
+    global const real4 *numbers = (global const real4 *)(shapes + (long)place.x * crowd.stride + shape_at(crowd, i));
+    const real4 one = relative_shape(numbers[0], i, crowd, pose_cell[n], pose[n]);
+    const real2 seen = directions_of(one, box_numbers(numbers, i, crowd), i, crowd, (real2)(1, 0)) * (SIGHTS / 4);
     for (int k = (int)floor(seen.x); k <= (int)floor(seen.y); ++k)
         atomic_or(&sights[2 * sight_at(crowd, n, k) + i / 32], (int)(1u << (i % 32)));
 }
@@ -31,11 +35,12 @@ kernel void meet_shapes(ARGUMENTS) {
     for (int i = 0; i < crowd.discs + crowd.boxes + crowd.segments; ++i) {
         global const real4 *numbers = (global const real4 *)(first + shape_at(crowd, i));
         const real4 one = relative_shape(numbers[0], i, crowd, cell, sensor);
-        const real2 size = box_size(numbers, i, crowd);
-        const int2 covered = covered_rays(shapes, world, crowd, n, i, cell, sensor, turns, rays);
+        const real4 box = box_numbers(numbers, i, crowd);
+        const int2 covered = covered_rays(one, box, i, crowd, sensor.zw, turns, rays);
+        if (i == world[2 * n + 1].y) continue;
         for (int place = covered.x; place < covered.x + covered.y; ++place) {
             const int at = place >= rays ? place - rays : place, k = turns[DIRECTIONS + 1 + at];
-            const real t = meet_shape(one, size, i, crowd, ray_direction(sensor, ray[at])).x;
+            const real t = meet_shape(one, box.xy, i, crowd, ray_direction(sensor, ray[at])).x;
             if (t < nearest[k]) nearest[k] = t;
         }
     }

@@ -24,8 +24,7 @@ long world_begin(global const int2 *world, const int n, const int each) { return
 // Ranges of directions of a particle's sights, and of a table of beams.
 #define SIGHTS 64
 #define DIRECTIONS 4096
-// Widening of a shape's range of directions, which covers rounding, as a sine and in quarters of a turn.
-#define WIDER (real)1e-5
+// Widening of a shape's range of directions, which covers rounding, in quarters of a turn.
 #define APART (real)1.25e-4
 
 #if SHAPES
@@ -43,11 +42,12 @@ real2 seen_between(const real2 low, const real2 high, const int around) {
     return (real2)(first, last < first ? last + 4 : last);
 }
 
-// Return the directions in which a disc, or a circle around a shape, is seen.
+// Return the directions in which a disc, or a circle around a shape, is seen; in all near its edge and inside.
 real2 directions_of_disc(const real x, const real y, const real radius) {
-    const real sine = radius / sqrt(x * x + y * y) + WIDER, cosine = sqrt((1 - sine) * (1 + sine));
-    return seen_between((real2)(x * cosine + y * sine, y * cosine - x * sine),
-                        (real2)(x * cosine - y * sine, y * cosine + x * sine), !(sine < (real)0.99));
+    const real square = x * x + y * y, along = sqrt(square - radius * radius);
+    return seen_between((real2)(x * along + y * radius, y * along - x * radius),
+                        (real2)(x * along - y * radius, y * along + x * radius),
+                        !(radius * radius < (real)0.98 * square - (real)1e-30));
 }
 
 // Return the directions in which a segment is seen.
@@ -64,27 +64,34 @@ int shape_at(const Crowd crowd, const int i) {
     return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments;
 }
 
-// Return the first and the last direction, relative to a heading (cos, sin), in which a particle sees a shape; the last
-// is below the first where it sees none.
-real2 directions_of(global const real *shapes, global const int2 *world, const Crowd crowd, const int n, const int i,
-                    const int2 cell, const real4 pose, const real2 heading) {
-    const int2 seen = world[2 * n + 1];
-    global const real *one = shapes + (long)seen.x * crowd.stride + shape_at(crowd, i);
-    const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-    if (i == seen.y || !(x - x == 0)) return (real2)(0, -1);
-    const real along = heading.x * x + heading.y * y, aside = heading.x * y - heading.y * x;
-    if (i < crowd.discs + crowd.boxes) return directions_of_disc(along, aside, i < crowd.discs ? one[2] : one[6]);
-    const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
-    return directions_of_segment(along, aside, heading.x * end_x + heading.y * end_y,
-                                 heading.x * end_y - heading.y * end_x);
+// Return a shape's numbers relative to a pose, from the first four in its world.
+real4 relative_shape(const real4 one, const int i, const Crowd crowd, const int2 cell, const real4 pose) {
+    const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
+    if (i < crowd.discs + crowd.boxes) return (real4)(x, y, one.z, one.w);
+    return (real4)(x, y, (one.z - cell.x) - pose.x, (one.w - cell.y) - pose.y);
+}
+
+// Return the other numbers of a box, 0 of other shapes.
+real4 box_numbers(global const real4 *one, const int i, const Crowd crowd) {
+    return i >= crowd.discs && i < crowd.discs + crowd.boxes ? one[1] : (real4)0;
+}
+
+// Return the first and the last direction, relative to a heading (cos, sin), in which a shape is seen, by its numbers
+// relative to a pose; the last is below the first for a shape that is none.
+real2 directions_of(const real4 one, const real4 box, const int i, const Crowd crowd, const real2 heading) {
+    if (!(one.x - one.x == 0)) return (real2)(0, -1);
+    const real along = heading.x * one.x + heading.y * one.y, aside = heading.x * one.y - heading.y * one.x;
+    if (i < crowd.discs + crowd.boxes) return directions_of_disc(along, aside, i < crowd.discs ? one.z : box.z);
+    return directions_of_segment(along, aside, heading.x * one.z + heading.y * one.w,
+                                 heading.x * one.w - heading.y * one.z);
 }
 
 // Return the rays that a shape covers: the place of the first among the rays in order, and their number; the first ray
 // follows the last. turns has the first place of each of DIRECTIONS ranges of directions relative to the heading, the
 // number of rays, and the rays in order.
-int2 covered_rays(global const real *shapes, global const int2 *world, const Crowd crowd, const int n, const int i,
-                  const int2 cell, const real4 pose, global const int *turns, const int rays) {
-    const real2 seen = directions_of(shapes, world, crowd, n, i, cell, pose, pose.zw);
+int2 covered_rays(const real4 one, const real4 box, const int i, const Crowd crowd, const real2 heading,
+                  global const int *turns, const int rays) {
+    const real2 seen = directions_of(one, box, i, crowd, heading);
     const int low = (int)floor(seen.x * (DIRECTIONS / 4)), high = (int)floor(seen.y * (DIRECTIONS / 4));
     const int from = low & (DIRECTIONS - 1), to = from + high - low, begin = turns[from];
     const int end = turns[(to & (DIRECTIONS - 1)) + 1] + (to >= DIRECTIONS ? rays : 0);
@@ -140,19 +147,7 @@ real2 meet_segment(const real dx, const real dy, const real x, const real y, con
     return (real2)((aside <= 0) & (end_aside >= 0) | (aside >= 0) & (end_aside <= 0) ? met : (real)INFINITY, straight);
 }
 
-// Return a shape's numbers relative to a pose, from the first four in its world.
-real4 relative_shape(const real4 one, const int i, const Crowd crowd, const int2 cell, const real4 pose) {
-    const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
-    if (i < crowd.discs + crowd.boxes) return (real4)(x, y, one.z, one.w);
-    return (real4)(x, y, (one.z - cell.x) - pose.x, (one.w - cell.y) - pose.y);
-}
-
-// Return half the length and width of a box, 0 of other shapes.
-real2 box_size(global const real4 *one, const int i, const Crowd crowd) {
-    return i >= crowd.discs && i < crowd.discs + crowd.boxes ? one[1].xy : (real2)0;
-}
-
-// Return the same of shape i of a world by its numbers relative to a pose.
+// Return the same of shape i of a world by its numbers relative to a pose, and of a box half its length and width.
 real2 meet_shape(const real4 one, const real2 size, const int i, const Crowd crowd, const real2 direction) {
     if (i < crowd.discs) return meet_disc(direction.x, direction.y, one.x, one.y, one.z);
     if (i < crowd.discs + crowd.boxes)
@@ -174,7 +169,7 @@ real2 nearest_shape(global const real *shapes, global const int2 *world, const C
             const int i = 32 * k + lowest_bit(left);
             global const real4 *one = (global const real4 *)(first + shape_at(crowd, i));
             const real4 near = relative_shape(one[0], i, crowd, cell, pose);
-            const real2 met = meet_shape(near, box_size(one, i, crowd), i, crowd, direction);
+            const real2 met = meet_shape(near, box_numbers(one, i, crowd).xy, i, crowd, direction);
             if (met.x < nearest.x) nearest = met;
         }
     }

@@ -15,7 +15,7 @@ from .shapes import (
     DIRECTIONS,
     DISC,
     QUARTER,
-    box_size,
+    box_numbers,
     covered_rays,
     directions_of,
     meet_shape,
@@ -42,7 +42,12 @@ def find_sights(shapes, world, pose_cell, pose, sights, particles, crowd):
     i = item % count
     if n >= particles:
         return
-    seen = directions_of(shapes, world, crowd, n, i, pose_cell[n], pose[n], vec2(NUMBER_ONE, NUMBER_ZERO))
+    place = cell_at(world, 2 * n + 1)
+    if i == place.y:
+        return
+    at = place.x * crowd.stride + shape_at(crowd, i)
+    one = relative_shape(shapes, at, i, crowd, cell_at(pose_cell, n), pose_at(pose, n))
+    seen = directions_of(one, box_numbers(shapes, at, i, crowd), i, crowd, vec2(NUMBER_ONE, NUMBER_ZERO))
     for k in range(int(wp.floor(seen.x * QUARTER)), int(wp.floor(seen.y * QUARTER)) + 1):
         # Each bit is added to a word once.
         wp.atomic_add(sights, 2 * sight_at(crowd, n, k) + (i >> 5), int(wp.uint32(1) << wp.uint32(i & 31)))
@@ -58,19 +63,21 @@ def meet_shapes(shapes, world, pose_cell, pose, ray, turns, ranges, particles, r
         return
     cell = cell_at(pose_cell, n)
     sensor = pose_at(pose, n)
-    first = cell_at(world, 2 * n + 1).x * crowd.stride
+    place = cell_at(world, 2 * n + 1)
+    first = place.x * crowd.stride
     for k in range(rays):
         ranges[n * rays + k] = limit
     for i in range(crowd.discs + crowd.boxes + crowd.segments):
         at = first + shape_at(crowd, i)
         one = relative_shape(shapes, at, i, crowd, cell, sensor)
-        size = box_size(shapes, at, i, crowd)
-        covered = covered_rays(shapes, world, crowd, n, i, cell, sensor, turns, rays)
-        for j in range(covered.y):
-            place = covered.x + j
-            place = wp.where(place >= rays, place - rays, place)
-            k = n * rays + turn_at(turns, DIRECTIONS + 1 + place)
-            met = meet_shape(one, size, i, crowd, ray_direction(sensor, ray_at(ray, place)))
+        box = box_numbers(shapes, at, i, crowd)
+        covered = covered_rays(one, box, i, crowd, vec2(sensor.z, sensor.w), turns, rays)
+        number = wp.where(i == place.y, 0, covered.y)
+        for j in range(number):
+            r = covered.x + j
+            r = wp.where(r >= rays, r - rays, r)
+            k = n * rays + turn_at(turns, DIRECTIONS + 1 + r)
+            met = meet_shape(one, vec2(box.x, box.y), i, crowd, ray_direction(sensor, ray_at(ray, r)))
             if met.x < ranges[k]:
                 ranges[k] = met.x
 

@@ -10,7 +10,7 @@ from .prelude import behind, kernel, loader, reader, work_item, writer
 from .ray import expected_range, ray_direction, tile_place, tile_ray, tile_step
 from .shapes import (
     DIRECTIONS,
-    box_size,
+    box_numbers,
     covered_rays,
     meet_shape,
     relative_shape,
@@ -78,8 +78,8 @@ def cast_tiles(
         k += tile_step(spread)
 
 
-# Work-items of a team, and most rays of which it finds the nearest shapes.
-TEAM, MOST_RAYS = 64, 512
+# Work-items of a team, most rays of which it finds the nearest shapes, and pairs of a shape and a ray that it marks.
+TEAM, MOST_RAYS, MARKED = 64, 384, wp.constant(32 * 64)
 
 
 def by_team(shared, alone):
@@ -87,46 +87,54 @@ def by_team(shared, alone):
     return f"#if defined(__CUDA_ARCH__)\n{shared}\n#else\n{alone}\n#endif\n"
 
 
-# A team's memory: its members' shapes, their sizes, ends and places of the members' pairs, the least distance of each
-# ray, a table of the members to which pairs belong, 2^3 pairs or more apart, and the pairs of the first warp.
-_MEMORY = "__shared__ __align__(16) int memory[1089]; return (unsigned long long)(size_t)memory;"
+# A team's memory: shapes, sizes of boxes, indices of the shapes and places of their first rays, marks, the least distance
+# of each ray, the pairs of the first warp, and all pairs. marks has a bit for the first pair of each shape, and for each
+# 32 pairs the number of shapes that begin before them, less one.
+_MEMORY = "__shared__ __align__(16) int memory[1026]; return (unsigned long long)(size_t)memory;"
 _SHARE_PAIRS = """
 int *numbers = (int *)(size_t)memory;
-int2 *spans = (int2 *)(numbers + 384);
 const int member = threadIdx.x;
-int all = pairs, apart_log = 3;
+// The members that have pairs are in the upper bits.
+int sum = pairs | (pairs > 0) << 16;
 for (int apart = 1; apart < 32; apart *= 2) {
-    const int other = __shfl_up_sync(0xffffffff, all, apart);
-    if ((member & 31) >= apart) all += other;
+    const int other = __shfl_up_sync(0xffffffff, sum, apart);
+    if ((member & 31) >= apart) sum += other;
 }
-if (member == 31) numbers[1088] = all;
+if (member == 31) numbers[1024] = sum;
 __syncthreads();
-if (member >= 32) all += numbers[1088];
-((float4 *)numbers)[member] = make_float4(one.c[0], one.c[1], one.c[2], one.c[3]);
-((float2 *)(numbers + 256))[member] = make_float2(size.c[0], size.c[1]);
-spans[member] = make_int2(all, begin - (all - pairs));
+if (member >= 32) sum += numbers[1024];
+const int rank = (sum >> 16) - 1, end = sum & 0xffff;
+if (pairs > 0) {
+    ((float4 *)numbers)[rank] = make_float4(one.c[0], one.c[1], one.c[2], one.c[3]);
+    ((float2 *)numbers)[128 + rank] = make_float2(box.c[0], box.c[1]);
+    ((int2 *)numbers)[192 + rank] = make_int2(i, begin - (end - pairs));
+}
+if (member == 63) numbers[1025] = end;
 __syncthreads();
-const int every = spans[63].x;
-while (every >> apart_log >= 256) ++apart_log;
-unsigned char *owner_at = (unsigned char *)(numbers + 1024);
-for (int i = (all - pairs + (1 << apart_log) - 1) >> apart_log; i << apart_log < all; ++i) owner_at[i] = member;
+return wp::vec_t<3, int>(numbers[1025], rank, end);
+"""
+_MARK_PAIRS = """
+int2 *marks = (int2 *)(size_t)memory + 256;
+marks[threadIdx.x] = make_int2(0, 0);
 __syncthreads();
-return wp::vec_t<2, int>(every, apart_log);
+if (pairs > 0 && end >= pairs && end - pairs < 2048)
+    atomicOr(&marks[(end - pairs) / 32].x, 1 << ((end - pairs) & 31));
+for (int word = (max(end - pairs, 0) + 31) / 32; word < 64 && 32 * word < end; ++word)
+    marks[word].y = rank - (32 * word == end - pairs);
+__syncthreads();
 """
 _OWNER_OF = """
-const int *numbers = (const int *)(size_t)memory;
-const int2 *spans = (const int2 *)(numbers + 384);
-int owner = ((const unsigned char *)(numbers + 1024))[pair >> apart_log];
-int2 span = spans[owner];
-while (span.x <= pair) span = spans[++owner];
-return wp::vec_t<2, int>(owner, span.y + pair);
+const int2 mark = ((const int2 *)(size_t)memory)[256 + pair / 32];
+const int rank = mark.y + __popc(mark.x & ((2u << (pair & 31)) - 1));
+const int2 place = ((const int2 *)(size_t)memory)[192 + rank];
+return wp::vec_t<3, int>(rank, place.x, place.y);
 """
 _ONE_OF = """
-const float4 shared = ((const float4 *)(size_t)memory)[owner];
+const float4 shared = ((const float4 *)(size_t)memory)[rank];
 return wp::vec_t<4, float>(shared.x, shared.y, shared.z, shared.w);
 """
 _SIZE_OF = """
-const float2 shared = ((const float2 *)(size_t)memory)[128 + owner];
+const float2 shared = ((const float2 *)(size_t)memory)[128 + rank];
 return wp::vec_t<2, float>(shared.x, shared.y);
 """
 
@@ -141,36 +149,43 @@ def members() -> wp.int32: ...
 def team_memory() -> wp.uint64: ...
 
 
-# Share each member's pairs, the place of its first ray and its shape, and return the number of pairs of all, and the
-# logarithm of their distance in the table.
-@wp.func_native(by_team(_SHARE_PAIRS, "return wp::vec_t<2, int>(pairs, 0);"))
-def share_pairs(memory: wp.uint64, begin: wp.int32, pairs: wp.int32, one: vec4, size: vec2) -> wp.vec2i: ...
+# Share each member's pairs, its shape and the place of its first ray. Return the number of all pairs, the member's place
+# among those that have pairs, and the end of its pairs.
+@wp.func_native(by_team(_SHARE_PAIRS, "return wp::vec_t<3, int>(pairs, 0, pairs);"))
+def share_pairs(
+    memory: wp.uint64, begin: wp.int32, pairs: wp.int32, i: wp.int32, one: vec4, box: vec4
+) -> wp.vec3i: ...  # fmt: skip
 
 
-# Return the member whose shape a pair has, and the place of its ray.
-@wp.func_native(by_team(_OWNER_OF, "return wp::vec_t<2, int>(0, begin + pair);"))
-def owner_of(memory: wp.uint64, begin: wp.int32, pair: wp.int32, apart_log: wp.int32) -> wp.vec2i: ...
+# Mark the next pairs of all members, from which on ``end`` counts.
+@wp.func_native(by_team(_MARK_PAIRS, ""))
+def mark_pairs(memory: wp.uint64, rank: wp.int32, end: wp.int32, pairs: wp.int32): ...
 
 
-# Return the first numbers of a member's shape.
+# Return the place of the shape of a marked pair, its index, and what to add to a pair for the place of its ray.
+@wp.func_native(by_team(_OWNER_OF, "return wp::vec_t<3, int>(0, i, begin);"))
+def owner_of(memory: wp.uint64, pair: wp.int32, i: wp.int32, begin: wp.int32) -> wp.vec3i: ...
+
+
+# Return the first numbers of a shape.
 @wp.func_native(by_team(_ONE_OF, "return one;"))
-def one_of(memory: wp.uint64, owner: wp.int32, one: vec4) -> vec4: ...
+def one_of(memory: wp.uint64, rank: wp.int32, one: vec4) -> vec4: ...
 
 
-# Return the size of a member's box.
-@wp.func_native(by_team(_SIZE_OF, "return size;"))
-def size_of(memory: wp.uint64, owner: wp.int32, size: vec2) -> vec2: ...
+# Return half the length and width of a box.
+@wp.func_native(by_team(_SIZE_OF, "return wp::vec_t<2, float>((float)box.c[0], (float)box.c[1]);"))
+def size_of(memory: wp.uint64, rank: wp.int32, box: vec4) -> vec2: ...
 
 
 # Begin with a distance of the team's ray k, whose range is number i.
-@wp.func_native(by_team("((float *)(size_t)memory)[512 + k] = t;", "values.data[i] = t;"))
+@wp.func_native(by_team("((float *)(size_t)memory)[640 + k] = t;", "values.data[i] = t;"))
 def begin_at(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: wp.int32, t: real): ...
 
 
 # Keep a distance if it is the least; the bits of numbers from 0 on grow with them.
 @wp.func_native(
     by_team(
-        "atomicMin((int *)(size_t)memory + 512 + k, __float_as_int(t));",
+        "atomicMin((int *)(size_t)memory + 640 + k, __float_as_int(t));",
         "if (t < values.data[i]) values.data[i] = t;",
     )
 )
@@ -178,7 +193,7 @@ def keep_least(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: 
 
 
 # Return the least distance of a ray.
-@wp.func_native(by_team("return ((const float *)(size_t)memory)[512 + k];", "return values.data[i];"))
+@wp.func_native(by_team("return ((const float *)(size_t)memory)[640 + k];", "return values.data[i];"))
 def least_at(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: wp.int32) -> real: ...
 
 
@@ -205,8 +220,9 @@ def cast_among_shapes(
         return
     memory = team_memory()
     cell = cell_at(pose_cell, n)
+    place = cell_at(world, 2 * n + 1)
     sensor = pose_at(pose, n)
-    first_shape = cell_at(world, 2 * n + 1).x * crowd.stride
+    first_shape = place.x * crowd.stride
     count = crowd.discs + crowd.boxes + crowd.segments
     for k in range(member, mine, members()):
         begin_at(memory, ranges, n * rays + turn_at(turns, DIRECTIONS + 1 + first + k), k, scale.limit)
@@ -215,30 +231,36 @@ def cast_among_shapes(
         begin = int(0)
         pairs = int(0)
         one = vec4()
-        size = vec2()
+        box = vec4()
         i = before + member
-        if i < count:
+        if i < count and i != place.y:
             at = first_shape + shape_at(crowd, i)
             one = relative_shape(shapes, at, i, crowd, cell, sensor)
-            size = box_size(shapes, at, i, crowd)
-            covered = covered_rays(shapes, world, crowd, n, i, cell, sensor, turns, rays)
+            box = box_numbers(shapes, at, i, crowd)
+            covered = covered_rays(one, box, i, crowd, vec2(sensor.z, sensor.w), turns, rays)
             # The covered rays among the team's, which may begin again at the first.
             since = covered.x - first + wp.where(covered.x < first, rays, 0)
             until = since + covered.y
             upper = wp.max(wp.min(until, mine) - since, 0)
             begin = wp.where(upper > 0, since, 0)
             pairs = upper + wp.max(wp.min(until - rays, mine), 0)
-        every = share_pairs(memory, begin, pairs, one, size)
-        for pair in range(member, every.x, members()):
-            owner = owner_of(memory, begin, pair, every.y)
-            k = wp.where(owner.y >= mine, owner.y - mine, owner.y)
-            met = meet_shape(
-                one_of(memory, owner.x, one), size_of(memory, owner.x, size), before + owner.x, crowd,
-                ray_direction(sensor, ray_at(ray, first + k)),
-            )  # fmt: skip
-            t = met.x
-            if t < scale.limit:
-                keep_least(memory, ranges, n * rays + turn_at(turns, DIRECTIONS + 1 + first + k), k, t)
+        shared = share_pairs(memory, begin, pairs, i, one, box)
+        done = int(0)
+        while done < shared.x:
+            mark_pairs(memory, shared.y, shared.z - done, pairs)
+            for pair in range(done + member, wp.min(done + MARKED, shared.x), members()):
+                owner = owner_of(memory, pair - done, i, begin)
+                k = owner.z + pair
+                k = wp.where(k >= mine, k - mine, k)
+                met = meet_shape(
+                    one_of(memory, owner.x, one), size_of(memory, owner.x, box), owner.y, crowd,
+                    ray_direction(sensor, ray_at(ray, first + k)),
+                )  # fmt: skip
+                t = met.x
+                if t < scale.limit:
+                    keep_least(memory, ranges, n * rays + turn_at(turns, DIRECTIONS + 1 + first + k), k, t)
+            wait()
+            done += MARKED
         before += members()
     wait()
     table = rest_of(map_table, world_begin(world, n, PLANES))

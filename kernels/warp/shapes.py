@@ -43,9 +43,9 @@ def world_begin(world: wp.array(dtype=wp.vec2i), n: wp.int32, each: wp.int32):
 number_at, four_at = reader(real), reader(real, 4)
 ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
 TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
-# Widening of a shape's range of directions, which covers rounding, as a sine and in quarters of a turn.
-WIDER, APART = real(1e-5), real(1.25e-4)
-THREE, TURN, QUARTER, NEAR, OPPOSITE = real(3.0), real(4.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
+# Widening of a shape's range of directions, which covers rounding, in quarters of a turn.
+APART = real(1.25e-4)
+THREE, TURN, QUARTER, NEAR, OPPOSITE = real(3.0), real(4.0), real(SIGHTS / 4), real(0.98), real(-1e-3)
 NEARLY_ALL = real(3.999)
 
 
@@ -70,12 +70,12 @@ def seen_between(low: vec2, high: vec2, around: wp.bool):
 
 @wp.func
 def directions_of_disc(x: real, y: real, radius: real):
-    """Return the directions in which a disc, or a circle around a shape, is seen."""
-    sine = radius / wp.sqrt(x * x + y * y) + WIDER
-    cosine = wp.sqrt((ONE - sine) * (ONE + sine))
-    low = vec2(x * cosine + y * sine, y * cosine - x * sine)
-    high = vec2(x * cosine - y * sine, y * cosine + x * sine)
-    return seen_between(low, high, not (sine < NEAR))
+    """Return the directions in which a disc, or a circle around a shape, is seen; in all near its edge and inside."""
+    square = x * x + y * y
+    along = wp.sqrt(square - radius * radius)
+    low = vec2(x * along + y * radius, y * along - x * radius)
+    high = vec2(x * along - y * radius, y * along + x * radius)
+    return seen_between(low, high, not (radius * radius < NEAR * square - TINY))
 
 
 @wp.func
@@ -101,28 +101,22 @@ def shape_at(crowd: Crowd, i: wp.int32):
 
 
 @wp.func
-def directions_of(
-    shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, i: wp.int32,
-    cell: wp.vec2i, pose: vec4, heading: vec2,
-):  # fmt: skip
-    """Return the first and the last direction, relative to a heading (cos, sin), in which a particle sees a shape;
-    the last is below the first where it sees none.
-    """
-    seen = world[2 * n + 1]
-    one = seen.x * crowd.stride + shape_at(crowd, i)
-    x = (number_at(shapes, one) - real(cell.x)) - pose.x
-    y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
-    if i == seen.y or not (x - x == ZERO):
-        return vec2(ZERO, MINUS_ONE)
-    along = heading.x * x + heading.y * y
-    aside = heading.x * y - heading.y * x
+def relative_shape(shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd, cell: wp.vec2i, pose: vec4):
+    """Return a shape's numbers relative to a pose, from the first four in its world."""
+    four = four_at(shapes, one)
+    x = (four[0] - real(cell.x)) - pose.x
+    y = (four[1] - real(cell.y)) - pose.y
     if i < crowd.discs + crowd.boxes:
-        return directions_of_disc(along, aside, number_at(shapes, one + wp.where(i < crowd.discs, 2, 6)))
-    end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
-    end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
-    return directions_of_segment(
-        along, aside, heading.x * end_x + heading.y * end_y, heading.x * end_y - heading.y * end_x
-    )
+        return vec4(x, y, four[2], four[3])
+    return vec4(x, y, (four[2] - real(cell.x)) - pose.x, (four[3] - real(cell.y)) - pose.y)
+
+
+@wp.func
+def box_numbers(shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd):
+    """Return the other numbers of a box, 0 of other shapes."""
+    if i >= crowd.discs and i < crowd.discs + crowd.boxes:
+        return four_at(shapes, one + 4)
+    return vec4(ZERO, ZERO, ZERO, ZERO)
 
 
 turn_at = reader(wp.int32)
@@ -130,15 +124,30 @@ EACH = real(DIRECTIONS / 4)
 
 
 @wp.func
+def directions_of(one: vec4, box: vec4, i: wp.int32, crowd: Crowd, heading: vec2):
+    """Return the first and the last direction, relative to a heading (cos, sin), in which a shape is seen, by its
+    numbers relative to a pose; the last is below the first for a shape that is none.
+    """
+    if not (one.x - one.x == ZERO):
+        return vec2(ZERO, MINUS_ONE)
+    along = heading.x * one.x + heading.y * one.y
+    aside = heading.x * one.y - heading.y * one.x
+    if i < crowd.discs + crowd.boxes:
+        return directions_of_disc(along, aside, wp.where(i < crowd.discs, one.z, box.z))
+    return directions_of_segment(
+        along, aside, heading.x * one.z + heading.y * one.w, heading.x * one.w - heading.y * one.z
+    )
+
+
+@wp.func
 def covered_rays(
-    shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, i: wp.int32,
-    cell: wp.vec2i, pose: vec4, turns: wp.array(dtype=wp.int32), rays: wp.int32,
+    one: vec4, box: vec4, i: wp.int32, crowd: Crowd, heading: vec2, turns: wp.array(dtype=wp.int32), rays: wp.int32
 ):  # fmt: skip
     """Return the rays that a shape covers: the place of the first among the rays in order, and their number; the first
     ray follows the last. turns has the first place of each of DIRECTIONS ranges of directions relative to the heading,
     the number of rays, and the rays in order.
     """
-    seen = directions_of(shapes, world, crowd, n, i, cell, pose, vec2(pose.z, pose.w))
+    seen = directions_of(one, box, i, crowd, heading)
     low = int(wp.floor(seen.x * EACH))
     high = int(wp.floor(seen.y * EACH))
     since = low & (DIRECTIONS - 1)
@@ -221,28 +230,8 @@ def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real)
 
 
 @wp.func
-def relative_shape(shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd, cell: wp.vec2i, pose: vec4):
-    """Return a shape's numbers relative to a pose, from the first four in its world."""
-    four = four_at(shapes, one)
-    x = (four[0] - real(cell.x)) - pose.x
-    y = (four[1] - real(cell.y)) - pose.y
-    if i < crowd.discs + crowd.boxes:
-        return vec4(x, y, four[2], four[3])
-    return vec4(x, y, (four[2] - real(cell.x)) - pose.x, (four[3] - real(cell.y)) - pose.y)
-
-
-@wp.func
-def box_size(shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd):
-    """Return half the length and width of a box, 0 of other shapes."""
-    if i >= crowd.discs and i < crowd.discs + crowd.boxes:
-        rest = four_at(shapes, one + 4)
-        return vec2(rest[0], rest[1])
-    return vec2(ZERO, ZERO)
-
-
-@wp.func
 def meet_shape(one: vec4, size: vec2, i: wp.int32, crowd: Crowd, direction: vec2):
-    """Return the same of shape i of a world by its numbers relative to a pose."""
+    """Return the same of shape i of a world by its numbers relative to a pose, and of a box half its length and width."""
     if i < crowd.discs:
         return meet_disc(direction.x, direction.y, one.x, one.y, one.z)
     if i < crowd.discs + crowd.boxes:
@@ -269,8 +258,9 @@ def nearest_shape(
             i = 32 * k + lowest_bit(left)
             left = left & (left - wp.uint32(1))
             one = first + shape_at(crowd, i)
-            size = box_size(shapes, one, i, crowd)
-            met = meet_shape(relative_shape(shapes, one, i, crowd, cell, pose), size, i, crowd, direction)
+            box = box_numbers(shapes, one, i, crowd)
+            near = relative_shape(shapes, one, i, crowd, cell, pose)
+            met = meet_shape(near, vec2(box.x, box.y), i, crowd, direction)
             if met.x < nearest.x:
                 nearest = met
     return nearest

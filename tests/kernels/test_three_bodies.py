@@ -84,14 +84,14 @@ ON_PURPOSE = [
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose(
         "shapes",
-        "seen_between directions_of_disc directions_of_segment sight_at shape_at relative_shape box_size meet_shape "
+        "seen_between directions_of_disc directions_of_segment sight_at shape_at relative_shape box_numbers meet_shape "
         "covered_rays",
         KERNELS_ONLY,
         "a ray tests the shapes near its direction; in the reference it tests every shape",
     ),
     Purpose(
         "ranges",
-        "by_team members team_memory share_pairs owner_of one_of size_of begin_at keep_least wait least_at",
+        "by_team members team_memory share_pairs mark_pairs owner_of one_of size_of begin_at keep_least least_at wait",
         (WARP,),
         "a kernel in OpenCL has its team's memory",
     ),

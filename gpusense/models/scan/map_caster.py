@@ -86,7 +86,7 @@ def require_exact(argument: str, method: Caster) -> None:
 LASER = Cones()
 # Most rays of a team of work-items, as in the kernel file ``ranges``, number of teams that fill any GPU, and
 # most teams of a launch.
-_RAYS_OF_TEAM, _ENOUGH_TEAMS, _MOST_TEAMS = 512, 4096, (1 << 25) - 1
+_RAYS_OF_TEAM, _ENOUGH_TEAMS, _MOST_TEAMS = 384, 4096, (1 << 25) - 1
 
 
 class Rays(NamedTuple):

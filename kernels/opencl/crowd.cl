@@ -1,5 +1,4 @@
-// Moving shapes of worlds: their places in the cells of grids, the directions in which poses see them, and the nearest
-// shapes along rays.
+// Moving shapes of worlds: their places in the cells of grids, directions from poses, and the nearest along rays.
 // requires: placement shapes
 
 // Largest number of a shape.

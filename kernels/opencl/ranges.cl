@@ -1,5 +1,5 @@
-// Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape, whose
-// distance stands in place of the range; see meet_shapes. Teams find the nearest shapes themselves.
+// Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape: ranges contain its
+// distance, see meet_shapes, or a team finds it.
 // requires: caster shapes
 
 // Cast rays: one work-item takes a particle and ray.
@@ -69,6 +69,7 @@ kernel void cast_among_shapes(ARGUMENTS) {
     const int parts = (rays + each - 1) / each, team = get_group_id(0), member = get_local_id(0);
     const int n = team / parts, first = team % parts * each, mine = min(each, rays - first);
     if (n >= particles) return;
+    const int before_next = (int)((2u << (member & 31)) - 1);
     const int2 cell = pose_cell[n], place = world[2 * n + 1];
     const real4 sensor = pose[n];
     const int count = crowd.discs + crowd.boxes + crowd.segments;
@@ -114,8 +115,8 @@ kernel void cast_among_shapes(ARGUMENTS) {
                 marks[word].y = rank - (32 * word == start - done);
             barrier(CLK_LOCAL_MEM_FENCE);
             for (int pair = done + member; pair < min(done + MARKED, every); pair += TEAM) {
-                const int2 mark = marks[(pair - done) / 32];
-                const int owner = mark.y + popcount(mark.x & (int)(2u << (pair & 31)) - 1);
+                const int2 mark = marks[(pair - done) >> 5];
+                const int owner = mark.y + popcount(mark.x & before_next);
                 const int2 of = places[owner];
                 const int k = of.y + pair - (of.y + pair >= mine ? mine : 0);
                 const real2 direction = ray_direction(sensor, ray[first + k]);

@@ -147,7 +147,7 @@ real2 meet_segment(const real dx, const real dy, const real x, const real y, con
     return (real2)((aside <= 0) & (end_aside >= 0) | (aside >= 0) & (end_aside <= 0) ? met : (real)INFINITY, straight);
 }
 
-// Return the same of shape i of a world by its numbers relative to a pose, and of a box half its length and width.
+// Return the same of shape i of a world by its numbers relative to a pose; a box also has a size.
 real2 meet_shape(const real4 one, const real2 size, const int i, const Crowd crowd, const real2 direction) {
     if (i < crowd.discs) return meet_disc(direction.x, direction.y, one.x, one.y, one.z);
     if (i < crowd.discs + crowd.boxes)

@@ -1,6 +1,4 @@
-"""Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape, see meet_shapes. Teams
-find the nearest shapes themselves.
-"""
+"""Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape, see meet_shapes."""
 
 import warp as wp
 
@@ -87,9 +85,9 @@ def by_team(shared, alone):
     return f"#if defined(__CUDA_ARCH__)\n{shared}\n#else\n{alone}\n#endif\n"
 
 
-# A team's memory: shapes, sizes of boxes, indices of the shapes and places of their first rays, marks, the least distance
-# of each ray, the pairs of the first warp, and all pairs. marks has a bit for the first pair of each shape, and for each
-# 32 pairs the number of shapes that begin before them, less one.
+# A team's memory: shapes, sizes of boxes, indices of the shapes and places of their first rays, marks, the least
+# distance of each ray, the pairs of the first warp, and all pairs. marks has a bit for the first pair of each shape,
+# and for each 32 pairs the number of shapes that begin before them, less one.
 _MEMORY = "__shared__ __align__(16) int memory[1026]; return (unsigned long long)(size_t)memory;"
 _SHARE_PAIRS = """
 int *numbers = (int *)(size_t)memory;
@@ -119,13 +117,15 @@ marks[threadIdx.x] = make_int2(0, 0);
 __syncthreads();
 if (pairs > 0 && end >= pairs && end - pairs < 2048)
     atomicOr(&marks[(end - pairs) / 32].x, 1 << ((end - pairs) & 31));
-for (int word = (max(end - pairs, 0) + 31) / 32; word < 64 && 32 * word < end; ++word)
+#pragma unroll 1
+for (int word = (max(end - pairs, 0) + 31) >> 5; word < 64 && 32 * word < end; ++word)
     marks[word].y = rank - (32 * word == end - pairs);
 __syncthreads();
 """
 _OWNER_OF = """
-const int2 mark = ((const int2 *)(size_t)memory)[256 + pair / 32];
-const int rank = mark.y + __popc(mark.x & ((2u << (pair & 31)) - 1));
+// A warp takes the pairs of one mark.
+const int2 mark = ((const int2 *)(size_t)memory)[256 + (pair >> 5)];
+const int rank = mark.y + __popc(mark.x & ((2u << (threadIdx.x & 31)) - 1));
 const int2 place = ((const int2 *)(size_t)memory)[192 + rank];
 return wp::vec_t<3, int>(rank, place.x, place.y);
 """
@@ -149,8 +149,8 @@ def members() -> wp.int32: ...
 def team_memory() -> wp.uint64: ...
 
 
-# Share each member's pairs, its shape and the place of its first ray. Return the number of all pairs, the member's place
-# among those that have pairs, and the end of its pairs.
+# Share each member's pairs, its shape and the place of its first ray. Return the number of all pairs, the member's
+# place among those that have pairs, and the end of its pairs.
 @wp.func_native(by_team(_SHARE_PAIRS, "return wp::vec_t<3, int>(pairs, 0, pairs);"))
 def share_pairs(
     memory: wp.uint64, begin: wp.int32, pairs: wp.int32, i: wp.int32, one: vec4, box: vec4
@@ -177,7 +177,7 @@ def one_of(memory: wp.uint64, rank: wp.int32, one: vec4) -> vec4: ...
 def size_of(memory: wp.uint64, rank: wp.int32, box: vec4) -> vec2: ...
 
 
-# Begin with a distance of the team's ray k, whose range is number i.
+# Begin with a distance of the team's ray k, of range i.
 @wp.func_native(by_team("((float *)(size_t)memory)[640 + k] = t;", "values.data[i] = t;"))
 def begin_at(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: wp.int32, t: real): ...
 

@@ -231,7 +231,7 @@ def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real)
 
 @wp.func
 def meet_shape(one: vec4, size: vec2, i: wp.int32, crowd: Crowd, direction: vec2):
-    """Return the same of shape i of a world by its numbers relative to a pose, and of a box half its length and width."""
+    """Return the same of shape i of a world by its numbers relative to a pose; a box also has a size."""
     if i < crowd.discs:
         return meet_disc(direction.x, direction.y, one.x, one.y, one.z)
     if i < crowd.discs + crowd.boxes:

@@ -10,7 +10,7 @@ from .flags import SEES, SHAPES
 from .placement import FARTHEST, FRAME_NUMBERS, frame_in, place_pose
 from .prelude import kernel, work_item
 from .shapes import SIGHTS, shape_distance, world_window
-from .types import Frame, Window, real, vec2
+from .types import Window, real, vec2
 
 # Cells above this one are unknown.
 MOST_KNOWN = wp.constant(127)

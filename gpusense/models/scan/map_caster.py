@@ -376,8 +376,9 @@ class MapCaster:
     def _meet_shapes(
         self, placed: PlacedPoses, ray: Rays, rays: int, flags: frozenset[str], common: dict[str, Any]
     ) -> tuple[Program, bool]:
-        """Return the launch that leaves the distances of moving shapes in place of ranges, or the launch of teams that
-        also casts the rays, and whether it does.
+        """Return the launch that finds the distances of moving shapes, and whether it also casts the rays.
+
+        Teams of work-items cast them; otherwise ranges contain the distances.
         """
         count, info = placed.count, self.backend.info
         parts = -(-rays // _RAYS_OF_TEAM)

@@ -66,7 +66,7 @@ kernel void cast_among_shapes(ARGUMENTS) {
     local real4 ones[TEAM];
     local real2 sizes[TEAM];
     local real nearest[MOST_RAYS];
-    const int parts = (rays + each - 1) / each, team = get_group_id(0), member = get_local_id(0);
+    const int parts = (rays + each - 1) / each, team = get_global_id(0) / TEAM, member = get_local_id(0);
     const int n = team / parts, first = team % parts * each, mine = min(each, rays - first);
     if (n >= particles) return;
     const int before_next = (int)((2u << (member & 31)) - 1);

@@ -145,12 +145,12 @@ def _long_reason(pipeline: ScanPipeline, poses: Any, ranges: Any, out: Any) -> s
     here = [a for a in (poses, ranges, out) if not arrays.on_device(a)]
     if not all(type(a) is np.ndarray and a.dtype in FLOATS for a in here):
         return "only NumPy arrays of float32 or float64 are copied with a recorded program"
-    if not fits(poses, len(ranges)):
+    if not fits(poses, ranges.shape[0]):
         return f"poses and ranges take more than {LARGEST >> 10} KiB"
     if pipeline.grid.cells.size > MOST_CELLS:
         return f"the map has more than {MOST_CELLS} cells"
-    if not is_short(len(poses), len(ranges)):
-        return f"{len(poses)} poses times {len(ranges)} readings are no short call"
+    if not is_short(poses.shape[0], ranges.shape[0]):
+        return f"{poses.shape[0]} poses times {ranges.shape[0]} readings are no short call"
     return ""
 
 

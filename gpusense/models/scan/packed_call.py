@@ -75,7 +75,8 @@ class PackedCall:
         sizes = [0 if kind is not None else math.prod(one) for kind, one in zip(inputs, shapes, strict=True)]
         packed = Packed(backend, sizes)
         results = Packed(backend, [count if out is None else 0, _INT.itemsize * 2 // real.itemsize], real)
-        given = packed.size if None in inputs else 0
+        # By identity: arrays of some libraries compare their numbers.
+        given = packed.size if any(one is None for one in inputs) else 0
         self._exchange = backend.exchange(packed.buffer, given, results.buffer, results.size, real)
         # The places of the inputs: arrays of the host, buffers with their bytes, or None for arrays in place.
         self._slots: list[Any] = []

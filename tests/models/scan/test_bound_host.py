@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.array_libraries import to_device
+from support.array_libraries import Array, to_device
 from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, NEAR, SCANS, cloud, mixed
 
 import gpusense as gs
@@ -286,6 +286,26 @@ def test_addresses_that_change_too_often_are_not_recorded(batching, monkeypatch)
         assert differing(out.numpy(), expected[at]) == 0
         assert len(model._short._places) <= 3
     assert 3 < len(made) <= 9
+
+
+def test_arrays_that_compare_their_numbers_are_told_apart_by_identity(batching, monkeypatch):
+    """As CuPy's, whose comparison with None is an array without a truth value."""
+
+    def compare(self: Array, other: object) -> bool:
+        raise ValueError("the truth value of an array is ambiguous")
+
+    monkeypatch.setattr(Array, "__eq__", compare)
+    model, plain = (FIELD(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    plain._short = None
+    expected = plain.log_likelihood(cloud(1), mixed(1))
+    poses, ranges, out = Array(to_device(cloud(1))), Array(to_device(mixed(1))), Array(to_device(expected * 0))
+    for at, readings in ((poses, mixed(1)), (cloud(1), ranges), (poses, ranges)):
+        found = model.bind(at, readings)()
+        assert differing(np.asarray(found) if at is not poses else found.held.numpy(), expected) == 0
+        for _ in range(4):
+            model.log_likelihood(at, readings, out=out if at is poses else None)
+        assert model._short.last is not None
+    assert differing(out.held.numpy(), expected) == 0
 
 
 @pytest.mark.parametrize("kind", MODELS)

@@ -99,12 +99,18 @@ class DaskExecutor(SupervisedExecutor):
     def _connect(self, address: str | None, names: list[str], security: Any) -> None:
         """Start a cluster or connect to the one at the address, and wait for a worker."""
         import distributed
+        from distributed.comm import get_address_host_port
 
         # A discarded client closes itself when it is collected. If that happened during the start of another client, it
         # would wait forever for a lock that this thread holds.
         gc.collect()
         if address is not None:
-            _check_address(address)
+            try:
+                # A client that fails on an address would leave a traceback.
+                get_address_host_port(address)
+            except ValueError as error:
+                rule = "dask: must be an address such as tcp://10.0.0.1:8786"
+                raise ValueError(f"{rule}, got {checks.show(address)}: {error}") from None
         try:
             self._cluster = None if address is not None else _local_cluster(names, security)
             target = address if self._cluster is None else self._cluster
@@ -245,17 +251,6 @@ class DaskExecutor(SupervisedExecutor):
         with contextlib.suppress(Exception):
             self._client.unregister_worker_plugin(self._name)
             self._client.unregister_scheduler_plugin(self._name)
-
-
-def _check_address(address: str) -> None:
-    """Check the form of a scheduler's address, since a client that fails on it leaves a traceback."""
-    from distributed.comm import get_address_host_port
-
-    try:
-        get_address_host_port(address)
-    except ValueError as error:
-        rule = "dask: must be an address such as tcp://10.0.0.1:8786"
-        raise ValueError(f"{rule}, got {checks.show(address)}: {error}") from None
 
 
 def _local_cluster(names: list[str], security: Any) -> Any:

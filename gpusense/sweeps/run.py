@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from gpusense._util import checks
 from gpusense.sweeps.executors import SerialExecutor
@@ -115,19 +115,19 @@ def run(
         setting = str(Path(root).resolve()), backend, secrets.token_hex(8)
         starts = Starts(pending, lambda job: chosen.submit(work, job, *setting), most)
 
-        def record(ended: Ended) -> None:
-            row = rows.add(ended.job, ended.outcome, ended.starts)
+        def record(job: Job, outcome: Outcome, number: int) -> None:
+            row = rows.add(job, outcome, number)
             counts[row["status"]] += 1
-            counts["repeated"] += ended.starts - 1
+            counts["repeated"] += number - 1
             on_row(row)
 
         try:
             for ended in starts.ended(lambda: size or _window(chosen)):
-                record(ended)
+                record(*ended)
         except (KeyboardInterrupt, SweepLost):
             # Keep the results of finished jobs.
             for ended in starts.left():
-                record(ended)
+                record(*ended)
             raise
         finally:
             starts.cancel()
@@ -140,12 +140,8 @@ def _window(executor: Executor) -> int:
     return int(getattr(executor, "window", _QUEUED * getattr(executor, "slots", os.cpu_count() or 1)))
 
 
-class Ended(NamedTuple):
-    """A job that has ended."""
-
-    job: Job
-    outcome: Outcome  # result of the job
-    starts: int  # number of starts
+Ended = tuple[Job, Outcome, int]
+"""A job, its result, and the number of its starts."""
 
 
 class Starts:
@@ -178,7 +174,8 @@ class Starts:
         wait(self._running, _ARRIVE)
         for future in [one for one in self._running if one.done() and not one.cancelled()]:
             if future.exception() is None:
-                yield Ended(self._running[future][0], future.result(), self._running[future][1])
+                job, starts = self._running[future]
+                yield job, future.result(), starts
             del self._running[future]
 
     def cancel(self) -> None:
@@ -199,15 +196,15 @@ class Starts:
         job, starts = self._running[future]
         error = CancelledError("a job was cancelled") if future.cancelled() else future.exception()
         if error is None:
-            return Ended(job, future.result(), starts)
+            return job, future.result(), starts
         if isinstance(error, WorkerDied):
             if isinstance(error, JobTimeout) or starts >= self._most:
                 times = f", {starts} times" if starts > 1 else ""
-                return Ended(job, Outcome({}, f"{type(error).__name__}: {error}{times}"), starts)
+                return job, Outcome({}, f"{type(error).__name__}: {error}{times}"), starts
             last = error.outside and starts + 1 == self._most
             (self._suspects if last else self._waiting).appendleft((job, starts))
             return None
         if isinstance(error, (BrokenExecutor, CancelledError, OSError)):
             raise SweepLost(f"executor: has ended before the sweep: {error_text(error)}") from error
         # The job's result cannot be sent, or its worker cannot run it.
-        return Ended(job, Outcome({}, error_text(error)), starts)
+        return job, Outcome({}, error_text(error)), starts

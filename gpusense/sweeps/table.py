@@ -66,8 +66,6 @@ class Table:
         self._stream.seek(0)
         data = self._stream.read()
         self.columns, self.rows = _parsed(data, self.path)
-        if data and not self.columns:
-            raise ValueError(f"{self.path}: must be the table of a sweep, got {checks.show(data[:40])}")
         self._stream.truncate(data.rfind(b"\n") + 1)
 
     def add(self, job: Job, outcome: Outcome, attempts: int) -> Row:
@@ -192,8 +190,10 @@ def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], dict[str, Row]]:
         lines = list(csv.reader(io.StringIO(data[: data.rfind(b"\n") + 1].decode(), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: must be a CSV file, got {error}") from None
-    if not lines:
+    if not data:
         return (), {}
+    if not lines:
+        raise ValueError(f"{path}: must be the table of a sweep, got {checks.show(data[:40])}")
     columns = tuple(lines[0])
     if columns[: len(FIRST)] != FIRST or columns[-len(LAST) :] != LAST or len(set(columns)) < len(columns):
         raise ValueError(f"{path}: must be the table of a sweep, got the columns {checks.show(lines[0])}")

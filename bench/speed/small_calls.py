@@ -172,16 +172,17 @@ class Bench:
         if self.gpu:
             there = on_device(self.device, poses)
             out = on_device(self.device, np.zeros(len(poses), np.float32))
-            into = functools.partial(call, poses=there, out=out)
-            self.add(f"{what}, on the device, out={label}", ways(into, into), kernels, count)
-            anew = functools.partial(call, poses=there)
-            self.add(f"{what}, poses on the device{label}", ways(anew, anew), kernels, count)
+            into, anew = functools.partial(call, poses=there, out=out), functools.partial(call, poses=there)
             ranges = [on_device(self.device, scan) for scan in scans]
 
             def both(number: int) -> Any:
                 return model.log_likelihood(there, ranges[number % len(ranges)])
 
-            self.add(f"{what}, poses and ranges on the device{label}", ways(both, anew), kernels, count)
+            for words, short, long in (
+                ("on the device, out=", into, into), ("poses on the device", anew, anew),
+                ("poses and ranges on the device", both, anew),
+            ):  # fmt: skip
+                self.add(f"{what}, {words}{label}", ways(short, functools.partial(long, one=plain)), kernels, count)
 
     def bound(
         self, what: str, model: Any, poses: np.ndarray, scan: np.ndarray, kernels: float,

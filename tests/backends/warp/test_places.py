@@ -75,6 +75,7 @@ def device(needs, monkeypatch):
     needs("warp")
     from gpusense.backends.warp import arrays
 
+    arrays._torch_type.cache_clear()
     current = types.SimpleNamespace(handle=0)
     for name, kind in (("torch", "Tensor"), ("cupy", "ndarray"), ("jaxlib", "Array")):
         module = types.ModuleType(name)
@@ -83,6 +84,7 @@ def device(needs, monkeypatch):
     torch, cupy = sys.modules["torch"], sys.modules["cupy"]
     torch.strided, torch.float32, torch.float64 = "strided", "torch.float32", "torch.float64"
     torch.cuda = types.SimpleNamespace(current_stream=lambda i: types.SimpleNamespace(cuda_stream=current.handle))
+    torch._C = types.SimpleNamespace(_cuda_getCurrentRawStream=lambda i: current.handle)
     cupy.cuda = types.SimpleNamespace(
         runtime=types.SimpleNamespace(getDevice=lambda: 0),
         get_current_stream=lambda: types.SimpleNamespace(ptr=current.handle),
@@ -139,12 +141,14 @@ def test_other_arrays_are_left_to_dlpack(make, facts, device):
             adopted(below(**vars(make(NUMBERS))), device, "poses")
 
 
-@pytest.mark.parametrize("make", [as_torch, as_cupy])
-def test_the_device_follows_the_stream_of_the_library(make, device):
+@pytest.mark.parametrize("make", [as_torch, as_cupy, "as_older_torch"])
+def test_the_device_follows_the_stream_of_the_library(make, device, monkeypatch):
     """Blocking streams follow the legacy stream without an event; no other stream does."""
     from gpusense.backends.warp.arrays import adopted
 
-    array = make(NUMBERS)
+    if make == "as_older_torch":
+        monkeypatch.delattr(sys.modules["torch"]._C, "_cuda_getCurrentRawStream")
+    array = (as_torch if make == "as_older_torch" else make)(NUMBERS)
     for handle, blocking, waited in (
         (0, True, []), (1, True, []), (5, True, []), (2, True, [2]), (SIDE_STREAM, True, [SIDE_STREAM]),
         (0, False, [0]), (5, False, []),
@@ -200,6 +204,30 @@ def test_memory_of_freed_results_is_used_again(needs):
     owners.clear()
     last.fill_(3.0)
     assert (last.numpy() == 3.0).all()
+
+
+def test_freed_memory_waits_for_every_blocking_stream(needs, monkeypatch):
+    """The legacy stream notes when the array was freed; a capture forbids that."""
+    import warp as wp
+
+    from gpusense.backends.warp.arrays import Results
+
+    needs("warp")
+    events: list[Any] = []
+    null = types.SimpleNamespace(record_event=lambda event: events.append(("record", event)))
+    current = types.SimpleNamespace(wait_event=lambda event: events.append(("wait", event)))
+    device = types.SimpleNamespace(
+        is_cuda=True, captures={}, null_stream=null, stream=current, context_guard=contextlib.nullcontext()
+    )
+    monkeypatch.setattr(wp, "Event", lambda device: object())
+    results, block = Results(device, get_backend("warp:cpu").empty), wp.zeros(32, dtype=wp.uint8, device="cpu")
+    for _ in range(2):
+        results.take_back(block)
+        assert results._memory(32) is block
+    assert events == [("record", events[0][1]), ("wait", events[0][1])] * 2
+    device.captures[1] = "a capture"
+    results.take_back(block)
+    assert results._memory(32) is not block and len(events) == 4
 
 
 def test_an_array_of_warp(needs):

@@ -74,6 +74,8 @@ class ScoreTables:
         stack = scores[None] if scores.ndim == 2 else scores
         tables, rows, cols = stack.shape
         self.backend, self.levels, self.stride, self._beyond = backend, levels, stride, beyond
+        # The columns of folded quarters lie across where the search chooses blocks by columns.
+        self.across = int(backend.info.kind == "gpu")
         self._fine = _STEP[backend.info.kind] - (stack.size > _FEW_CELLS)
         # The margin holds all pooled cells that a table's cells reach, and a run of cells beyond them.
         self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + self.step(levels) - 1 + RUN)
@@ -149,7 +151,7 @@ class ScoreTables:
                 quarters = self.backend.empty(_all_cells(exact), _INT)
                 self.backend.compile("fold_quarters", _NO_FLAGS)(
                     _launched(exact), self.level(level - 1), made, quarters, self.shape, shape, exact, period, step,
-                    period // 2, self._beyond, unit,
+                    period // 2, self._beyond, unit, self.across,
                 )  # fmt: skip
             table = made
             if not flags:

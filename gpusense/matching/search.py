@@ -231,12 +231,12 @@ class _Run:
             flags=self._ahead,
         )  # fmt: skip
 
-    def _quarters(self, level: int) -> tuple[tuple[Any, ...], ScoreTable, tuple[int, int]]:
-        """Return quarters and end points of a level, the tables' sizes, and the cells between 2^n positions with n."""
+    def _quarters(self, level: int) -> tuple[tuple[Any, ...], ScoreTable, tuple[int, int, int]]:
+        """Return quarters and ends of a level, sizes, cells between 2^n positions, n, and if columns lie across."""
         if level < self._level - 1:
-            return (self._tables.quarters(level), *self._ends), self._tables.shape, (self._tables.stride, 0)
+            return (self._tables.quarters(level), *self._ends), self._tables.shape, (self._tables.stride, 0, 0)
         folded = self._tables.folded(self._level)
-        return (folded.quarters, *self._quarter_ends), folded.quarters_shape, (1, self._level)
+        return (folded.quarters, *self._quarter_ends), folded.quarters_shape, (1, self._level, self._tables.across)
 
     def _follow(self) -> None:
         """Raise lower bounds: follow the best parts of promising blocks down to poses."""

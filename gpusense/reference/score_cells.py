@@ -17,8 +17,13 @@ def padded_stride(scores: ScoreTable) -> int:
     return scores.cols + 2 * scores.margin
 
 
-def cell_index(scores: ScoreTable, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+def within(number: np.ndarray, last: int) -> np.ndarray:
+    """Return the nearest numbers from 0 to last."""
+    return np.minimum(np.maximum(number, 0), last)
+
+
+def cell_index(scores: ScoreTable, row: np.ndarray, col: np.ndarray, *, across: int = 0) -> np.ndarray:
     """Return the index of a cell in its table; cells beyond the margin have the value of the margin's outer cells."""
-    line = np.minimum(np.maximum(row, -scores.margin), scores.rows + scores.margin - 1) + scores.margin
-    begin = np.minimum(np.maximum(col, -scores.margin), scores.cols + scores.margin - 1) + scores.margin
-    return line * padded_stride(scores) + begin
+    lines, stride = padded_lines(scores), padded_stride(scores)
+    line, begin = within(row + scores.margin, lines - 1), within(col + scores.margin, stride - 1)
+    return begin * lines + line if across else line * stride + begin

@@ -72,7 +72,7 @@ def pack_quarters(flags, table, quarters, scores, reach):
     quarters[: four.size // 4] = packed_losses(four.max(axis=-1), four)
 
 
-def fold_quarters(flags, table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit):
+def fold_quarters(flags, table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit, across):
     """Write the losses of the quarters of blocks, relative to the folded table of bounds, as images."""
     four, side = quarters_at(table, scores, reach), period // step
     shape = (scores.tables, period, period, padded_lines(folded), padded_stride(folded))
@@ -86,12 +86,14 @@ def fold_quarters(flags, table, bound, quarters, scores, bounds, folded, period,
             part = four[:, i::period, j::period]
             images[:, i, j, margin : margin + part.shape[1], margin : margin + part.shape[2]] = part
     most = TOP - unit * losses.astype(np.int32).repeat(step, axis=1).repeat(step, axis=2)
+    if across:
+        most, images = most.swapaxes(3, 4), images.swapaxes(3, 4)
     quarters[: most.size] = packed_losses(most, images)
 
 
 def divided(
     quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray, block: np.ndarray,
-    scores: ScoreTable, spacing: int, shift: int,
+    scores: ScoreTable, spacing: int, shift: int, across: int,
 ) -> np.ndarray:  # fmt: skip
     """Return the scores (M, 4) of the quarters of blocks (M, 4): score less the losses of the item's points."""
     total = np.empty((len(block), 4), np.int32)
@@ -103,7 +105,7 @@ def divided(
         for chosen in (mine[i : i + step] for i in range(0, len(mine), step)):
             row = spacing * (block[chosen, 1, None] >> shift) + point[None, points, 1]
             col = spacing * (block[chosen, 2, None] >> shift) + point[None, points, 0]
-            four = quarters[begin + cell_index(scores, row, col)]
+            four = quarters[begin + cell_index(scores, row, col, across=across)]
             for i in range(4):
                 total[chosen, i] = block[chosen, 3] - (four >> 8 * i & 255).sum(axis=1, dtype=np.int32)
     return total
@@ -191,12 +193,12 @@ def choose_blocks(
 
 def follow_blocks(
     flags, quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing,
-    shift,
+    shift, across,
 ):  # fmt: skip
     """Replace blocks by their best allowed quarters of 2^level x 2^level; a block without any has the score -1."""
     here = block[: 4 * blocks].reshape(blocks, 4)
     mine = np.flatnonzero(here[:, 3] >= 0)
-    total = divided(quarters, point, image, first, here[mine], scores, spacing, shift)
+    total = divided(quarters, point, image, first, here[mine], scores, spacing, shift, across)
     parts, within = _quarters_of(here[mine], allowed, height, width, columns, level)
     total = np.where(within, total, -1)
     best = total.argmax(axis=1)
@@ -208,12 +210,12 @@ def follow_blocks(
 
 def divide_blocks(
     flags, quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run,
-    height, width, columns, turns, level, spacing, shift,
+    height, width, columns, turns, level, spacing, shift, across,
 ):  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""
     blocks = min(int(count[level + 1]) - begin, some)
     here = block[4 * begin : 4 * (begin + blocks)].reshape(blocks, 4)
-    total = divided(quarters, point, image, first, here, scores, spacing, shift)
+    total = divided(quarters, point, image, first, here, scores, spacing, shift, across)
     parts, within = _quarters_of(here, allowed, height, width, columns, level)
     number, which = np.nonzero(within & (total >= low[here[:, 0] // turns, None]))
     made = np.column_stack([here[number, 0], parts[number, which], total[number, which]])

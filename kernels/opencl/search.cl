@@ -2,7 +2,11 @@
 // requires: score_cells
 
 // Points after which sums are compared, and points whose losses fit 15 bits.
+#if READ_AHEAD
+#define STEP 16
+#else
 #define STEP 48
+#endif
 #define TOGETHER 128
 // Numbers that count the lines of a scan by their scores.
 #define BINS 512
@@ -65,7 +69,8 @@ kernel void pack_quarters(ARGUMENTS) {
 }
 
 // Write the losses of the quarters of blocks, relative to the blocks' scores in the folded table of bounds, as images of
-// every period-th row and column: one for each of period^2 first cells. One work-item takes a cell of an image.
+// every period-th row and column: one for each of period^2 first cells. With across, the cells of a column follow each
+// other, as the chosen blocks of a column do. One work-item takes a cell of an image.
 kernel void fold_quarters(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
     const int lines = padded_lines(folded), stride = padded_stride(folded);
@@ -79,13 +84,20 @@ kernel void fold_quarters(ARGUMENTS) {
         four = quarters_at(table + source * rows * cols, scores, from_line, from_col, reach);
     const int coarse = (source * side + row_phase / step) * side + col_phase / step;
     const int loss = bound[coarse * padded_lines(bounds) * padded_stride(bounds) + block_index(bounds, whole_row, whole_col, 0, 0)];
-    quarters[(image * lines + line) * stride + col] = packed_losses(TOP - unit * loss, four);
+    const int place = across ? col * lines + line : line * stride + col;
+    quarters[image * lines * stride + place] = packed_losses(TOP - unit * loss, four);
 }
 
 // Return the scores of a block's quarters: score less the losses of points begin to end - 1. Once all are below least, the
-// other points are left out.
+// other points are left out. The columns of a table lie across on GPUs, see fold_quarters.
 int4 divided(global const int *quarters, global const int2 *point, global const int *image, const ScoreTable scores,
-             const int begin, const int end, const int row, const int col, const int score, const int least) {
+             const int begin, const int end, const int row, const int col, const int score, const int least, const int across) {
+    const int lines = padded_lines(scores), stride = padded_stride(scores);
+#if READ_AHEAD
+    const int down = across ? 1 : stride, right = across ? lines : 1;
+#else
+    const int down = stride, right = 1;
+#endif
     int4 total = (int4)(score);
     for (int k = begin; k < end;) {
         const int stop = end - k > STEP ? k + STEP : end;
@@ -95,7 +107,8 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
 #pragma unroll 8
 #endif
         for (; k < stop; ++k) {
-            const int four = quarters[image[k] + block_index(scores, point[k].y + row, point[k].x + col, 0, 0)];
+            const int line = within(point[k].y + row + scores.margin, lines - 1);
+            const int four = quarters[image[k] + line * down + within(point[k].x + col + scores.margin, stride - 1) * right];
             even += four & 0xff00ff;
             odd += four >> 8 & 0xff00ff;
         }
@@ -265,7 +278,7 @@ kernel void follow_blocks(ARGUMENTS) {
     if (n >= blocks || block[4 * n + 3] < 0) return;
     const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
     const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
-                              spacing * (col >> shift), block[4 * n + 3], -1);
+                              spacing * (col >> shift), block[4 * n + 3], -1, across);
     const int total[4] = {sums.x, sums.y, sums.z, sums.w};
     int most = -1;
     for (int i = 0; i < 4; ++i) {
@@ -289,7 +302,7 @@ kernel void divide_blocks(ARGUMENTS) {
         global const int *here = block + 4 * (begin + n);
         const int item = here[0], row = here[1], col = here[2], least = low[item / turns];
         const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
-                                  spacing * (col >> shift), here[3], least);
+                                  spacing * (col >> shift), here[3], least, across);
         const int total[4] = {sums.x, sums.y, sums.z, sums.w};
         for (int i = 0; i < 4; ++i) {
             const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;

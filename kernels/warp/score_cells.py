@@ -18,8 +18,14 @@ def padded_stride(scores: ScoreTable):
 
 
 @wp.func
+def within(number: wp.int32, last: wp.int32):
+    """Return the nearest number from 0 to last."""
+    return wp.min(wp.max(number, 0), last)
+
+
+@wp.func
 def block_index(scores: ScoreTable, row: wp.int32, col: wp.int32, rows: wp.int32, cols: wp.int32):
     """Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read."""
-    line = wp.min(wp.max(row + scores.margin, 0), padded_lines(scores) - 1 - rows)
-    begin = wp.min(wp.max(col + scores.margin, 0), padded_stride(scores) - 1 - cols)
-    return line * padded_stride(scores) + begin
+    stride = padded_stride(scores)
+    line = within(row + scores.margin, padded_lines(scores) - 1 - rows)
+    return line * stride + within(col + scores.margin, stride - 1 - cols)

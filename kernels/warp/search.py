@@ -5,13 +5,13 @@ import warp as wp
 from gpusense.interface.constants import SHIFT_ROWS, TOP
 
 from .prelude import kernel, reader
-from .score_cells import ScoreTable, block_index, padded_lines, padded_stride
+from .score_cells import ScoreTable, block_index, padded_lines, padded_stride, within
 
 number_at, cell_at = reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 # Points after which sums are compared, points that are read together, and points whose losses fit 15 bits.
-STEP = 48
+STEP = 16
 AT_ONCE = 8
 TOGETHER = 128
 # Numbers that count the lines of a scan by their scores.
@@ -94,7 +94,7 @@ def pack_quarters(table, quarters, scores, reach):
 
 
 @kernel
-def fold_quarters(table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit):
+def fold_quarters(table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit, across):
     """Write the losses of the quarters of blocks as images, relative to the scores in the folded table of bounds."""
     image, line, col = wp.tid()
     lines = padded_lines(folded)
@@ -115,15 +115,26 @@ def fold_quarters(table, bound, quarters, scores, bounds, folded, period, step, 
     coarse = (source * side + row_phase // step) * side + col_phase // step
     begin = coarse * padded_lines(bounds) * padded_stride(bounds)
     loss = int(bound[begin + block_index(bounds, whole_row, whole_col, 0, 0)])
-    quarters[(image * lines + line) * stride + col] = packed_losses(TOP - unit * loss, four)
+    place = line * stride + col
+    if across != 0:
+        place = col * lines + line
+    quarters[image * lines * stride + place] = packed_losses(TOP - unit * loss, four)
 
 
 @wp.func
 def divided(
     quarters: wp.array(dtype=wp.int32), point: wp.array(dtype=wp.vec2i), image: wp.array(dtype=wp.int32),
     scores: ScoreTable, begin: wp.int32, end: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32, least: wp.int32,
+    across: wp.int32,
 ):  # fmt: skip
     """Return the scores of a block's quarters: score less the losses of points begin to end - 1."""
+    lines = padded_lines(scores)
+    stride = padded_stride(scores)
+    down = int(stride)
+    right = int(1)
+    if across != 0:
+        down = int(1)
+        right = lines
     total = wp.vec4i(score, score, score, score)
     k = int(begin)
     while k < end:
@@ -135,7 +146,9 @@ def divided(
             for i in range(AT_ONCE):
                 n = wp.min(k + i, stop - 1)
                 cell = cell_at(point, n)
-                four = number_at(quarters, number_at(image, n) + block_index(scores, cell.y + row, cell.x + col, 0, 0))
+                line = within(cell.y + row + scores.margin, lines - 1)
+                aside = within(cell.x + col + scores.margin, stride - 1)
+                four = number_at(quarters, number_at(image, n) + line * down + aside * right)
                 if k + i >= stop:
                     four = int(0)
                 even = even + (four & 0xFF00FF)
@@ -332,7 +345,8 @@ def choose_blocks(score, best, low, block, count, all, lines, length, spacing, a
 
 @kernel
 def follow_blocks(
-    quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing, shift
+    quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing, shift,
+    across,
 ):  # fmt: skip
     """Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones."""
     n = wp.tid()
@@ -346,7 +360,7 @@ def follow_blocks(
     col = block[4 * n + 2]
     total = divided(
         quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
-        spacing * (col >> shift), score, -1,
+        spacing * (col >> shift), score, -1, across,
     )  # fmt: skip
     most = int(-1)
     for i in range(4):
@@ -363,7 +377,7 @@ def follow_blocks(
 @kernel
 def divide_blocks(
     quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run, height,
-    width, columns, turns, level, spacing, shift,
+    width, columns, turns, level, spacing, shift, across,
 ):  # fmt: skip
     """Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level,
     and collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which
@@ -380,7 +394,7 @@ def divide_blocks(
         least = low[item // turns]
         total = divided(
             quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
-            spacing * (col >> shift), block[here + 3], least,
+            spacing * (col >> shift), block[here + 3], least, across,
         )  # fmt: skip
         for i in range(4):
             part_row = row + ((i // 2) << level)

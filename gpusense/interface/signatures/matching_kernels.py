@@ -87,7 +87,7 @@ KERNELS: dict[str, Kernel] = {
     "fold_quarters": kernel(
         "search", "col line image", _CELLS, f"uchar bound [{_size('bounds')}]", f"out int quarters [{_size('folded')}]",
         "ScoreTable scores", "ScoreTable bounds", "ScoreTable folded", "int period", "int step", "int reach",
-        "int beyond", "int unit",
+        "int beyond", "int unit", "int across",
     ),
     "place_ends": kernel(
         "search_ends", "worker item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
@@ -129,13 +129,13 @@ KERNELS: dict[str, Kernel] = {
     "follow_blocks": kernel(
         "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "out int block [4 * blocks]",
         "ScoreTable scores", "int blocks", "int height", "int width", "int columns", "int level", "int spacing",
-        "int shift",
+        "int shift", "int across",
     ),
     "divide_blocks": kernel(
         "search", "worker", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * (begin + some)]",
         "int low [scans]", "out int part [4 * room]", "out int count [levels]", "ScoreTable scores", "int begin",
         "int some", "int room", "int workers", "int run", "int height", "int width", "int columns", "int turns",
-        "int level", "int spacing", "int shift",
+        "int level", "int spacing", "int shift", "int across",
     ),
     "split_scans": kernel(
         "segments", "scan", *_NOISY, "out real cost [points]", "out int stop [points]", "int scans", "int points",

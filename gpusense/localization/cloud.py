@@ -178,7 +178,7 @@ class Cloud(Particles):
 
     def _replay(self, indices: list[int], stage: Stage, judged: Sequence[SensorReadings]) -> None:
         """Run a stage of a correction by sensors ``indices`` as one recorded program."""
-        sensors = tuple([(index, self._scored[index].version) for index in indices])
+        sensors = tuple([(index, self._scored[index].model.table_version) for index in indices])
         key = (sensors, stage, self.count, self._refines_too, self._prepare_judges(judged))
         recorded = self._recordings.get(key)
         if recorded is None:

@@ -109,7 +109,7 @@ class FilterCore:
         if share is not None:
             particles = tracker.moved_particles()
             if is_together(tracker.mean_and_covariance()[1]):
-                used = skipped(self.sensors, used, particles, verdict.anywhere(), share)
+                used = skipped(self.sensors, used, particles, verdict.anywhere, share)
         judged = verdict.expected(scans, tracker.progress.motion)
         tracker.weigh(used, judged=judged, meanwhile=functools.partial(self._use_wait, everything))
         tracker.learn(used, self.recovery.is_doubted)
@@ -239,8 +239,8 @@ def without_skipped(
     share: float,
 ) -> tuple[Any, ...]:
     """Return a scan with missing readings for the beams that less than a share of the particles explains."""
-    parts = sensor.parts(np.vstack([poses, elsewhere]), reading)
-    near, far = parts[: len(poses)], parts[len(poses) :]
+    _, parts = sensor.model.log_likelihood(np.vstack([poses, elsewhere]), *reading, per_beam=True)
+    near, far = np.split(np.asarray(parts, np.float64), [len(poses)])
     used = (near != 0).any(axis=0)
     least = boundary(far[:, used])
     if least is None:

@@ -80,10 +80,6 @@ class Sensor:
             self._judge = MapJudge(self.backend, self.model.grid)
         return self._judge
 
-    def parts(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray:
-        """Return (N, K) log-likelihoods of the beams of a scan, in float64."""
-        return np.asarray(self.model.log_likelihood(poses, *reading, per_beam=True)[1], np.float64)
-
     def score(
         self,
         poses: Any,
@@ -116,11 +112,6 @@ class Sensor:
     def records(self, reading: tuple[Any, ...]) -> bool:
         """Return whether a recorded program can score the reading: a scan on the host or on the device."""
         return self.calibrates and len(reading) == 1 and not self.model.compat
-
-    @property
-    def version(self) -> int:
-        """Version of the map's table, a key of recorded programs."""
-        return self.model.table_version if self.calibrates else 0
 
     def place(self, reading: tuple[Any, ...], values: np.ndarray) -> Buffer | None:
         """Write the ranges of a scan to ``values``, which the caller copies to the device.

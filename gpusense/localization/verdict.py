@@ -7,6 +7,7 @@ evidence, and W is omitted.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -57,7 +58,6 @@ class Verdict:
 
     def __init__(self, sensors: Sequence[Sensor], random_poses: Callable[[int], np.ndarray], *, seed: int = 0) -> None:
         self._sensors, self._random_poses = sensors, random_poses
-        self._poses: np.ndarray | None = None
         self._evidence = {
             index: Evidence(sensor.model, seed=seed)
             for index, sensor in enumerate(sensors)
@@ -99,11 +99,10 @@ class Verdict:
                 ratios = *ratios, ratio_of_features(gain, len(features), _LEAST_GAIN)
         self.state = self.state._replace(ratios=ratios)
 
+    @functools.cached_property
     def anywhere(self) -> np.ndarray:
-        """Return poses anywhere in the free space, for comparison."""
-        if self._poses is None:
-            self._poses = self._random_poses(_RANDOM)
-        return self._poses
+        """Poses anywhere in the free space, for comparison."""
+        return self._random_poses(_RANDOM)
 
     def corrected(self) -> None:
         """Count a correction."""

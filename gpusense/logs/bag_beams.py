@@ -126,13 +126,13 @@ def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, 
     overridden, total = (range_min is not None, range_max is not None), found.total()
     if (common := _common_angles(angles_of)) is not None:
         first, step, count = common
-        alike = sum(
+        same = sum(
             scans for (angles, low, high), scans in found.items()
             if angles == common and (overridden[0] or max(low, 0.0) == near) and (overridden[1] or high == far)
         )  # fmt: skip
-        if alike < total:
+        if same < total:
             warn_user(
-                f"{place}: scans with other beams or range limits: {total - alike} of {total}; their readings are "
+                f"{place}: scans with other beams or range limits: {total - same} of {total}; their readings are "
                 "placed on the nearest beams of the others"
             )
         return Beams(first, step, distinct_beams(step, count), near, far, overridden, False)
@@ -167,13 +167,13 @@ def _common_angles(found: Counter[Angles]) -> Angles | None:
     full = Counter({angles: scans for angles, scans in found.items() if angles[2] > 0}) or found
     best, most = None, 0
     for candidate, _ in full.most_common(_CANDIDATES):
-        scans = sum(number for other, number in full.items() if _alike(candidate, other))
+        scans = sum(number for other, number in full.items() if alike(candidate, other))
         if scans > most:
             best, most = candidate, scans
     return best if 2 * most > full.total() else None
 
 
-def _alike(one: Angles, other: Angles) -> bool:
+def alike(one: Angles, other: Angles) -> bool:
     """Return whether two scans have equally many beams, and bearings that agree within a small share of a step."""
     (first, step, count), (begin, stride, number) = one, other
     apart = max(abs(first - begin), abs(first + step * (count - 1) - begin - stride * (number - 1)))

@@ -14,7 +14,7 @@ from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import Nav2Options
 from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
 from gpusense.localization.scan_motion import Moment
-from gpusense.logs.bag_beams import Beams
+from gpusense.logs.bag_beams import Beams, alike
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import BACK, TransformError
 from gpusense.ros.conversions import (
@@ -30,7 +30,7 @@ from gpusense.ros.conversions import (
     status_fields,
 )
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.messages import stamp_of
+from gpusense.world.messages import laser_beams, stamp_of
 from gpusense.world.scanner import Scanner
 
 PLACES = 1440
@@ -39,8 +39,8 @@ PLACES = 1440
 _PATIENCE = 5.0
 # Scans that the likely cause is looked for in.
 _HISTORY = 150
-# Least difference of distinct bearings as a share of a step, and of distinct mounts [m, rad].
-_SAME, _SAME_MOUNT = 0.05, 1e-3
+# Least difference of distinct mounts [m, rad].
+_SAME_MOUNT = 1e-3
 # Standard deviations of a first pose, as in nav2_amcl [m, m, rad].
 _START = (0.5, 0.5, math.pi / 12)
 
@@ -200,14 +200,18 @@ class Localizer:
         The first scan's geometry is the scanner. After a scan of another geometry, all scans move to common bearings,
         so that varying beams need only a second model. Readings of 0 are missing, and each scan keeps its limits.
         """
-        limits = scanner.range_min, scanner.range_max
-        if self._scanner is None or self._beams is None or self.filter is None:
-            self._beams = Beams(fields["angle_min"], fields["angle_increment"], scanner.count, *limits)
+        angles, limits = laser_beams(fields), (scanner.range_min, scanner.range_max)
+        before, beams = self._scanner, self._beams
+        if before is None or beams is None or self.filter is None:
+            beams = self._beams = Beams(*angles, *limits)
             self._make(scanner)
-        elif not self._beams.varied and not alike(scanner, self._scanner):
-            self._beams = Beams(-math.pi, 2 * math.pi / PLACES, PLACES, *limits, varied=True)
-            self._make(self._beams.scanner(scanner.mount, upside_down=False))
-        return self._beams.take(fields)[0]
+        elif not beams.varied and not (
+            alike((beams.first, beams.step, beams.count), angles)
+            and np.allclose(before.mount, scanner.mount, rtol=0, atol=_SAME_MOUNT)
+        ):
+            beams = self._beams = Beams(-math.pi, 2 * math.pi / PLACES, PLACES, *limits, varied=True)
+            self._make(beams.scanner(scanner.mount, upside_down=False))
+        return beams.take(fields)[0]
 
     def _make(self, scanner: Scanner | None) -> None:
         assert self.grid is not None and scanner is not None
@@ -226,14 +230,6 @@ class Localizer:
             self.filter.initialize_uniform()
         else:
             self.filter.initialize(mean=self._start[0], covariance=self._start[1])
-
-
-def alike(first: Scanner, second: Scanner) -> bool:
-    """Return whether two scanners have the same bearings, up to rounding, and the same mount."""
-    if first.count != second.count or not np.allclose(first.mount, second.mount, rtol=0, atol=_SAME_MOUNT):
-        return False
-    step = abs(float(first.bearings[1] - first.bearings[0])) if first.count > 1 else 1.0
-    return bool(np.abs(first.bearings - second.bearings).max() < _SAME * step)
 
 
 MOST = 500

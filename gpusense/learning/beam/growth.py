@@ -8,7 +8,7 @@ computes log p and gradient of every pair on the host, in Newton steps within bo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from gpusense.learning.beam.em import climb_em
 from gpusense.learning.beam.pairs import Bounds, Pairs, Point
 from gpusense.learning.beam.problem import NO_PRIOR, Problem, Value
 from gpusense.learning.beam.report import report
-from gpusense.learning.fitted import BeamFit
+from gpusense.learning.fitted import BeamFit, Fitted, PointFit
 from gpusense.learning.point import problem as hosted
 from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.learning.point.problem import mix, of_weight
@@ -224,35 +224,30 @@ def fit_jointly(
     )  # fmt: skip
     end = hosted.maximize(problem, _ITERATIONS, tolerance)
     blocks = None if pairs.block is None else pairs.block[known]
-    values = problem.values(end.theta)
     inner = hosted.report(problem, end, problem.parameters(end.theta, hit), blocks, fit.missing)
     names = (*fit.standard_errors, *new)
-    if fit.bias_fitted:
-        bias, error = values["range_bias"], inner.standard_errors["range_bias"]
-    else:
-        bias, error = _offset(problem, end, tolerance, blocks)
+    offset = inner if fit.bias_fitted else _with_offset(problem, end, tolerance, blocks)
+    bias, error, independent = (
+        math.nan if offset is None else getattr(offset, name)["range_bias"]
+        for name in ("values", "standard_errors", "independent_errors")
+    )
     rows = _causes(problem, end, known)
-    independent = dict(inner.independent_errors)
-    independent.setdefault("range_bias", fit.independent_errors["range_bias"])
+    shared = {each.name: getattr(inner, each.name) for each in fields(Fitted)}
     return replace(
-        fit, parameters=inner.parameters, log_likelihood=end.value, trace=inner.trace, converged=end.converged,
-        status=inner.status, standard_errors={name: inner.standard_errors[name] for name in names},
-        independent_errors=independent, held=inner.held, range_bias=bias, range_bias_error=error,
-        iterations=inner.iterations, outliers=int((np.argmax(rows[known][~none][:, [0, 1, 3]], axis=1) == 2).sum()),
+        fit, **shared | {"standard_errors": {name: inner.standard_errors[name] for name in names}},
+        independent_errors=inner.independent_errors | {"range_bias": independent}, range_bias=bias,
+        range_bias_error=error, outliers=int((np.argmax(rows[known][~none][:, [0, 1, 3]], axis=1) == 2).sum()),
         responsibilities=rows if responsibilities else None,
     )  # fmt: skip
 
 
-def _offset(
+def _with_offset(
     problem: _Growing, end: hosted.Climb, tolerance: float, blocks: NDArray[np.int64] | None
-) -> tuple[float, float]:
-    """Fit the offset as well, and return it with its standard error; NaN if the search did not converge."""
+) -> PointFit[BeamParameters] | None:
+    """Fit the offset as well; None if the search did not converge."""
     joint = replace(problem, fit_bias=True)
     best = hosted.climb(joint, np.insert(end.theta, _BIAS, 0.0), _ITERATIONS, tolerance)
-    if not best.converged:
-        return math.nan, math.nan
-    errors = hosted.report(joint, best, problem.start, blocks, 0).standard_errors
-    return float(best.theta[_BIAS]), errors["range_bias"]
+    return hosted.report(joint, best, problem.start, blocks, 0) if best.converged else None
 
 
 def _causes(problem: _Growing, end: hosted.Climb, known: NDArray[np.bool_]) -> Floats:

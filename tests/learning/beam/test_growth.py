@@ -81,6 +81,12 @@ def test_without_growth_the_fit_is_the_plain_one() -> None:
     assert fit.range_bias_error == pytest.approx(plain.range_bias_error, rel=1e-3)
 
 
+def test_the_independent_error_of_the_offset_is_that_with_growth() -> None:
+    z, expected = draw(800, 4)
+    fit = gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, backend="numpy")
+    assert fit.converged and fit.range_bias_error == fit.independent_errors["range_bias"] > 0
+
+
 @pytest.mark.parametrize("options", [{}, {"hit": "student"}, {"range_bias": True}], ids=str)
 def test_readings_at_one_range_do_not_determine_the_growth(options: dict[str, Any]) -> None:
     """Only sigma_hit + sigma_growth z* is determined; over blocks, gradients vanish along the other direction."""

@@ -333,7 +333,7 @@ class RepeatCache(Generic[T]):
         # The least recently used first, each with the number of the call that used it last.
         self._kept: dict[Hashable, tuple[T, int]] = {}
         # Numbers of calls by keys without a recording.
-        self._seen = ProgramCache[int](2 * most)
+        self._seen = ProgramCache[int](8 * most)
 
     def __len__(self) -> int:
         return len(self._kept)

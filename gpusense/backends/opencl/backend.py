@@ -39,6 +39,8 @@ from gpusense.interface.sources import assemble, relevant, uses_double
 # The fill command of one driver hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
+# Largest copy from a GPU that is started after a wait for launches [bytes].
+_FEW_BYTES = 1 << 10
 # Copies to a GPU of these sizes [bytes] take NVIDIA's driver nearly twice as long if they do not block.
 _SLOW = (64 << 10, 256 << 10)
 
@@ -148,6 +150,9 @@ class OpenCLBackend(ProcessBound, Backend):
             if self._staging is not None and self._staging.download(buffer, out):
                 return out
             with driver_errors():
+                if wait and out.nbytes <= _FEW_BYTES:
+                    # NVIDIA's driver waits longer for a copy than for launches and an idle device's copy.
+                    self._queue.finish()
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
 

@@ -235,7 +235,17 @@ def wrapped(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], d
     # Imported on use, since the import takes a while and NumPy arrays do not need it.
     import pyopencl.array
 
-    return pyopencl.array.Array(queue, shape, dtype, data=buffer if math.prod(shape) else None)
+    count = math.prod(shape)
+    data = buffer if count else None
+    strides = tuple(dtype.itemsize * max(math.prod(shape[axis + 1 :]), 1) for axis in range(len(shape)))
+    try:
+        # Without checks, which take as long as a launch.
+        return pyopencl.array.Array(
+            None, shape, dtype, data=data, strides=strides, _fast=True, _size=count, _context=queue.context,
+            _queue=queue,
+        )  # fmt: skip
+    except TypeError:
+        return pyopencl.array.Array(queue, shape, dtype, data=data)
 
 
 # ---- properties of devices

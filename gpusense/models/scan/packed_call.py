@@ -34,7 +34,7 @@ MOST_CELLS = 1 << 22
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 # Numbers of sizes and of places of short calls that are kept; ordinary calls before the first short one; and calls
 # after which places make room for others.
-_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE = 8, 12, 2, 4096
+_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE = 8, 16, 2, 4096
 
 
 def fits(poses: Any, readings: int) -> bool:
@@ -230,16 +230,18 @@ class PackedCallCache:
         there = [None if isinstance(one, np.ndarray) else one for one in operands]
         kinds = [None if one is None else one.dtype for one in there]
         size = (operands[0].shape[0], *kinds, operands[1].dtype)
-        if there != [None, None]:
-            address = self._pipeline.backend.address
-            places = [None if one is None else address(one.buffer) for one in there]
-            for result in (address(target), None) if in_place else (None,):
-                key = (*size, *places, result)
-                call = self._places.found(key, functools.partial(self._recorded, key, there, target, corners))
+        address = self._pipeline.backend.address
+        at, readings = (None if one is None else address(one.buffer) for one in there)
+        # What changes is copied: scans more often than poses, and results that the user keeps.
+        pairs = dict.fromkeys([(at, readings), (at, None), (None, None)])
+        for result in (address(target), None) if in_place else (None,):
+            for pair in pairs:
+                key = (*size, *pair, result)
+                cache = self._sizes if (*pair, result) == (None, None, None) else self._places
+                call = cache.found(key, functools.partial(self._recorded, key, there, target, corners))
                 if call is not None:
                     return call
-        key = (*size, None, None, None)
-        return self._sizes.found(key, functools.partial(self._recorded, key, there, target, corners))
+        return None
 
     def _recorded(
         self, key: tuple[Any, ...], there: list[Adopted | None], target: Any, corners: Corners | None

@@ -237,6 +237,23 @@ def test_arrays_whose_addresses_repeat_are_used_in_place(kind, there, batching, 
     assert model.explain() == plain.explain()
 
 
+@pytest.mark.parametrize("changing", ["scans", "both"])
+def test_only_arrays_that_change_are_copied(changing, batching, monkeypatch):
+    device = batching[0]
+    model, plain = (FIELD(GRID, NEAR, backend=device) for _ in range(2))
+    plain._short = None
+    poses, out, held = to_device(cloud(0)), to_device(np.zeros(COUNT, np.float32)), []
+    copied, copy = [], device.copy
+    monkeypatch.setattr(device, "copy", lambda *given, **how: (copied.append(given), copy(*given, **how)))
+    for seed in range(8):
+        held.append((poses if changing == "scans" else to_device(cloud(seed)), to_device(mixed(seed))))
+        copied.clear()
+        model.log_likelihood(*held[-1], out=out)
+        numbers = {"scans": 1, "both": 2}[changing]
+        assert seed < 5 or (len(copied) == numbers and model._short.last is not None)
+        assert differing(out.numpy(), plain.log_likelihood(held[-1][0].numpy(), mixed(seed))) == 0
+
+
 @pytest.mark.parametrize("kind", MODELS)
 def test_results_that_are_kept_stay(kind, batching):
     """Poses and readings are used in place, while every result has other memory."""

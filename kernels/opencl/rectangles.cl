@@ -96,13 +96,20 @@ kernel void free_rows(ARGUMENTS) {
     const long cell = (long)row * cols, other = (long)band * cols + cell;
     int right = min(cells_right(line, words, last, LONGEST), cols - last);
     int left = min(cells_left(line, from, LONGEST), from + 1);
+    uint ahead = 0, behind = 0;
     for (int i = 0; i <= last - from; ++i) {
         const int forward = from + i, back = last - i;
         if (i > 0) right = line[back >> 5] >> (back & 31) & 1 ? 0 : right + 1;
         if (i > 0) left = line[forward >> 5] >> (forward & 31) & 1 ? 0 : left + 1;
-        runs[cell + back] = (uchar)min(right, LONGEST);
-        runs[other + forward] = (uchar)min(left, LONGEST);
+        ahead = ahead << 8 | min(right, LONGEST);
+        behind |= min(left, LONGEST) << 8 * i;
     }
+    global uchar *to = runs + cell + from, *back = runs + other + from;
+    if (last - from == 3 && (((size_t)to | (size_t)back) & 3) == 0) {
+        *(global uint *)to = ahead, *(global uint *)back = behind;
+        return;
+    }
+    for (int i = 0; i <= last - from; ++i) to[i] = (uchar)(ahead >> 8 * i), back[i] = (uchar)(behind >> 8 * i);
 }
 
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of

@@ -13,7 +13,15 @@ OCCUPIED = 1
 # Capacity of the stack of columns that may bound a rectangle.
 STACK = 256
 behind_of, run_at = behind(wp.uint16), reader(wp.uint8)
-put, put_run = writer(wp.uint16), writer(wp.uint8)
+put = writer(wp.uint16)
+
+
+# Write up to four runs.
+@wp.func_native("""
+if (count == 4 && ((size_t)(values.data + i) & 3) == 0) *(int *)(values.data + i) = runs;
+else for (int k = 0; k < count; ++k) values.data[i + k] = (unsigned char)(runs >> 8 * k);
+""")
+def put_runs(values: wp.array(dtype=wp.uint8), i: wp.int32, count: wp.int32, runs: wp.int32): ...
 
 
 # Write four rows, the last first, or in this order where the direction is below 0.
@@ -155,14 +163,16 @@ def free_rows(bits, runs, band, cols, words, begin, end):
     line = row * words
     right = wp.min(cells_right(bits, line, words, last, LONGEST), cols - last)
     left = wp.min(cells_left(bits, line, start, LONGEST), start + 1)
+    ahead = int(0)
+    behind = int(0)
     for i in range(last - start + 1):
-        forward = start + i
-        back = last - i
         if i > 0:
-            right = wp.where(occupied_at(bits, line, back), 0, right + 1)
-            left = wp.where(occupied_at(bits, line, forward), 0, left + 1)
-        put_run(runs, row * cols + back, wp.uint8(wp.min(right, LONGEST)))
-        put_run(runs, (band + row) * cols + forward, wp.uint8(wp.min(left, LONGEST)))
+            right = wp.where(occupied_at(bits, line, last - i), 0, right + 1)
+            left = wp.where(occupied_at(bits, line, start + i), 0, left + 1)
+        ahead = (ahead << 8) | wp.min(right, LONGEST)
+        behind = behind | (wp.min(left, LONGEST) << (8 * i))
+    put_runs(runs, row * cols + start, last - start + 1, ahead)
+    put_runs(runs, (band + row) * cols + start, last - start + 1, behind)
 
 
 @kernel

@@ -17,13 +17,26 @@ MOST_KNOWN = wp.constant(127)
 RING = wp.constant(2)
 
 
+# Return the number of fours of cells if they are aligned, else 0.
+@wp.func_native("return (size_t)(cells.data + first) & 3 ? 0 : count / 4;")
+def fours_of(cells: wp.array(dtype=wp.uint8), first: wp.int32, count: wp.int32) -> wp.int32: ...
+
+
+# Copy four cells.
+@wp.func_native("*(unsigned int *)(store.data + to) = *(const unsigned int *)(cells.data + first);")
+def put_four(store: wp.array(dtype=wp.uint8), to: wp.int32, cells: wp.array(dtype=wp.uint8), first: wp.int32): ...
+
+
 @kernel
 def put_cells(cells, place, store, count, worlds, items):
     """Copy the cells of some worlds to their places. One work-item takes every items-th cell."""
     w, first = wp.tid()
     if first >= items or w >= worlds:
         return
-    for i in range(first, count, items):
+    fours = fours_of(cells, w * count, count)
+    for i in range(first, fours, items):
+        put_four(store, place[w] + 4 * i, cells, w * count + 4 * i)
+    for i in range(4 * fours + first, count, items):
         store[place[w] + i] = cells[w * count + i]
 
 

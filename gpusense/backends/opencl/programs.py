@@ -60,7 +60,11 @@ class Programs:
         source = assemble(file, flags)
         # Bitcode belongs to the version of LLVM, which the platform's version names.
         version = [self._device.platform.version] if self._of_bitcode else []
-        key = program_key(self.info, source, [*self.options, *version])
+        options = [*self.options]
+        registers = max(row.registers for row in KERNELS.values() if row.file == file)
+        if registers and "IN_TEAMS" in flags and "NVIDIA" in self._device.vendor:
+            options.append(f"-cl-nv-maxrregcount={registers}")
+        key = program_key(self.info, source, [*options, *version])
         # PoCL's kernels are kept singly. For a binary, it would compile every kernel of the program for work-groups of
         # any size, which takes three times as long as the rest of the build.
         if self.pocl is None and (program := self._kept(key)) is not None:
@@ -69,7 +73,7 @@ class Programs:
             if self.pocl is not None and self._of_bitcode:
                 return self._built_of_bitcode(self.pocl, file, source, key), key
             with contextlib.nullcontext() if self.pocl is None else self.pocl.building(key):
-                program = self.built(cl.Program(self._context, source))
+                program = self.built(cl.Program(self._context, source), options)
         except cl.RuntimeError as error:
             log = with_places(str(error), source)
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error

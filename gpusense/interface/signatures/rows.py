@@ -93,7 +93,8 @@ class Kernel:
     compiled with IN_LANES has groups of ``lanes_group`` work-items; with ``in_lanes`` a work-item takes as many
     neighbours of the first axis as a vector has lanes. With IN_TEAMS the ``team`` work-items of a group share an item,
     with SMALL_TEAMS an eighth as many, so the first axis has as many work-items for each. ``apart`` says that no two of
-    its arrays share memory, so a compiler need not reload arguments after a write.
+    its arrays share memory, so a compiler need not reload arguments after a write. ``registers`` limits the registers
+    of a work-item of a team on NVIDIA's GPUs, so that more teams run at once; 0 sets no limit.
     """
 
     file: str
@@ -104,6 +105,7 @@ class Kernel:
     lanes_group: int = 1
     apart: bool = False
     team: int = 1
+    registers: int = 0
 
     @functools.cached_property
     def optional(self) -> frozenset[str]:
@@ -154,6 +156,7 @@ def kernel(
     lanes_group: int = 1,
     apart: bool = False,
     team: int = 1,
+    registers: int = 0,
 ) -> Kernel:
     """Return the kernel whose arguments are rows such as ``"out real parts [particles * features] if PER_BEAM"``."""
     arguments = []
@@ -162,7 +165,7 @@ def kernel(
         head, _, shape = declared.partition("[")
         *output, kind, name = head.split()
         arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"], flag))
-    return Kernel(file, tuple(launch.split()), tuple(arguments), group, in_lanes, lanes_group, apart, team)
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group, in_lanes, lanes_group, apart, team, registers)
 
 
 WINDOW = "Window window"

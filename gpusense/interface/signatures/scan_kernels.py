@@ -82,6 +82,7 @@ KERNELS: dict[str, Kernel] = {
     "cast_among_shapes": kernel(
         "ranges", "item", *_CAST, *POSES, "real2 ray [rays]", "int turns [4097 + rays]",
         "out real ranges [particles * rays]", "int particles", "int rays", *_CASTING, "int each", apart=True, team=64,
+        registers=40,
     ),
     "beam_tiles": kernel(
         "beam", "item", *_CAST, *_NORMALS, *POSES, _ORDER, _CONES, _FIRST, "real reading [readings]", *_TERMS,

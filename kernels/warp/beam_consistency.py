@@ -4,11 +4,11 @@ import math
 
 import warp as wp
 
-from gpusense.interface import constants
+from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 
 from .flags import IN_TEAMS, SMALL_TEAMS
 from .heading import cos_sin
-from .prelude import kernel, work_item
+from .prelude import by_device, kernel, work_item
 from .types import Frame
 
 # Values of unknown cells, and of places off the map, also unknown.
@@ -18,17 +18,7 @@ STEP, AFAR, MINUS_AFAR = wp.float64(0.5), wp.float64(1e9), wp.float64(-1e9)
 ZERO, ONE, MINUS_ONE = wp.float64(0.0), wp.float64(1.0), wp.float64(-1.0)
 TWO = wp.float64(2.0)
 FOREVER = wp.float64(math.inf)
-NOTHING, AGREES = constants.NOTHING, constants.AGREES
-SHORT, THROUGH = constants.SHORT, constants.THROUGH
-VANISHED = constants.VANISHED
 MOST_WALKERS, FEWER_WALKERS = 256, 32
-_WALKERS = """
-#if defined(__CUDA_ARCH__)
-return blockDim.x;
-#else
-return 1;
-#endif
-"""
 _LEAST_OF_TEAM = f"""
 #if defined(__CUDA_ARCH__)
 __shared__ double shared[2 * {MOST_WALKERS}];
@@ -49,7 +39,7 @@ return own;
 
 
 # Return the number of work-items that share a walk; on processors the first work-item walks alone.
-@wp.func_native(_WALKERS)
+@wp.func_native(by_device("blockDim.x", "1"))
 def walkers() -> wp.int32: ...
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .prelude import reader
+from .prelude import by_device, reader
 
 NONE = 0x7FFFFFFF
 ALL_BITS = wp.uint32(0xFFFFFFFF)
@@ -10,24 +10,12 @@ word_at = reader(wp.int32)
 
 
 # Return the index of the lowest 1 of a word that is not 0.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return __ffs(word) - 1;
-#else
-return __builtin_ctz(word);
-#endif
-""")
+@wp.func_native(by_device("__ffs(word) - 1", "__builtin_ctz(word)"))
 def lowest_bit(word: wp.uint32) -> wp.int32: ...
 
 
 # Return the index of the highest 1 of a word that is not 0.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return 31 - __clz(word);
-#else
-return 31 - __builtin_clz(word);
-#endif
-""")
+@wp.func_native(by_device("31 - __clz(word)", "31 - __builtin_clz(word)"))
 def highest_bit(word: wp.uint32) -> wp.int32: ...
 
 

@@ -6,7 +6,7 @@ from gpusense.interface.constants import FIELD_RING
 
 from .error_free import pair_sum, two_product, two_sum
 from .flags import BILINEAR, EXACT_EXPONENT, FLOAT64, INSIDE, TWO_PART_POINTS
-from .prelude import fused
+from .prelude import by_device, fused
 from .types import Window, real, vec2, vec4
 
 
@@ -19,6 +19,7 @@ def field_cell(col: wp.int32, row: wp.int32, window: Window):
 
 
 one = "double" if FLOAT64 else "float"
+half = f"static_cast<{one}>(0.5)"
 ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
 MINUS_ONE = real(-1.0)
 EDGE = real(2.0**-33)
@@ -103,13 +104,7 @@ def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: r
 # Return the largest distance from a cell's centre at which rounding certainly gives the cell: half a cell less the
 # rounding errors of an end point. guard bounds them for rounded products, with 3.12 eps of the reading and 1.5 eps
 # altogether. GPUs fuse products, and the errors are 2 eps and 1.6 eps.
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-return static_cast<{one}>(0.5) - static_cast<{one}>(0.6875) * guard;
-#else
-return static_cast<{one}>(0.5) - guard;
-#endif
-""")
+@wp.func_native(by_device(f"{half} - static_cast<{one}>(0.6875) * guard", f"{half} - guard"))
 def rounding_margin(guard: real) -> real: ...
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .flags import FLOAT64, ROUNDED_CELLS
-from .prelude import exact_fma, fuses, fuses_on_gpu
+from .prelude import exact_fma, fuses, on_gpu
 from .types import real, vec2, vec4
 
 # Sums over beams add the terms of a block plainly, then the sum of the block to a compensated total. The accuracy is
@@ -12,7 +12,7 @@ from .types import real, vec2, vec4
 # compensated total. So work-items or lanes that share a block exchange no terms.
 multiply_add = exact_fma(real)
 # Beside fused products the loop that rounds cells takes 1.4 times as long on processors.
-at_once = fuses_on_gpu if ROUNDED_CELLS else fuses
+at_once = on_gpu if ROUNDED_CELLS else fuses
 SPLITTER = real(134217729.0 if FLOAT64 else 4097.0)
 
 

@@ -9,6 +9,8 @@ from .float64.error_free import pair_product, two_sum
 from .prelude import doubles
 
 f = doubles(formulas)
+# A name of the module, which generated code copies once a function, not once a use.
+WORDS = f.WORDS
 LARGEST_HEADING = wp.float64(constants.LARGEST_HEADING)
 S0, S1, S2, S3, S4, S5 = map(wp.float64, formulas.S)
 C0, C1, C2, C3, C4, C5 = map(wp.float64, formulas.C)
@@ -55,7 +57,7 @@ def reduce_huge(theta: wp.float64):
     below = wp.uint64(0)
     for i in range(6):
         k = 5 - i
-        both = wp.uint64(f.WORDS[word + k]) << wp.uint64(32) | wp.uint64(f.WORDS[word + k + 1])
+        both = wp.uint64(WORDS[word + k]) << wp.uint64(32) | wp.uint64(WORDS[word + k + 1])
         here = both << shift >> wp.uint64(32)
         sum_1 = low_half * here + carry_1
         sum_2 = high_half * below + (sum_1 & MASK_32) + carry_2

@@ -3,6 +3,7 @@
 import warp as wp
 
 from .flags import IN_TEAMS, SMALL_TEAMS
+from .prelude import on_gpu
 from .types import real, vec2, vec4
 
 # Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
@@ -12,13 +13,6 @@ MATCH_BLOCKS = 8
 # Numbers that are summed at once: in float64 they take 18 of the 32 KiB that every device shares at least.
 AT_ONCE = 9
 # Bodies of functions of a team. Work-items of processors share nothing: the first member takes all points.
-_COOPERATES = """
-#if defined(__CUDA_ARCH__)
-return true;
-#else
-return false;
-#endif
-"""
 _ADD_OVER_TEAM = """
 #if defined(__CUDA_ARCH__)
 __shared__ {real} shared[{some} * {team}];
@@ -74,17 +68,12 @@ FULL_TURN = real(6.283185307179586)
 DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
 
 
-# Return whether members share memory.
-@wp.func_native(_COOPERATES)
-def cooperates() -> bool: ...
-
-
 @wp.func
 def log_share(count: wp.int32):
     """Return log2 of the points of a member, enough for all members to cover count."""
     members = int(1)
     log = int(MATCH_BLOCKS - 1)
-    if IN_TEAMS and cooperates():
+    if IN_TEAMS and on_gpu():
         members = TEAM
         log = 0
     while (members << log) < count:

@@ -4,7 +4,7 @@ import warp as wp
 
 from .error_free import pair_product, two_product, two_sum
 from .flags import FLOAT64, IN_LANES
-from .prelude import fuses_on_gpu, log1p_of_gpu
+from .prelude import log1p_of_gpu, on_gpu
 from .types import real, vec2, vec4
 
 if IN_LANES:
@@ -55,7 +55,7 @@ def bounded_square(u: vec2):
 @wp.func
 def log_one_plus(x: real):
     """Return log(1 + x) for x > -1; on processors the rounding error of 1 + x is corrected to first order."""
-    if fuses_on_gpu():
+    if on_gpu():
         return gpu_log1p(x)
     more = ONE + x
     return log(more) + (x - (more - ONE)) / more

@@ -180,14 +180,13 @@ def doubles(module):
     return made
 
 
+def by_device(gpu, processor):
+    """Make C++ that returns the value of one expression on GPUs, and of another on processors."""
+    return f"#if defined(__CUDA_ARCH__)\nreturn {gpu};\n#else\nreturn {processor};\n#endif\n"
+
+
 # Return the work-item of a launch of one dimension, given wp.tid(), which divides a number of 64 bits by 1.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return blockIdx.x * blockDim.x + threadIdx.x;
-#else
-return tid;
-#endif
-""")
+@wp.func_native(by_device("blockIdx.x * blockDim.x + threadIdx.x", "tid"))
 def work_item(tid: wp.int32) -> wp.int32: ...
 
 
@@ -244,7 +243,7 @@ def field_readers(struct):
     def make(field):
         kind, place = struct.vars[field].type, f"values.data->{field}"
 
-        @wp.func_native(f"#if defined(__CUDA_ARCH__)\nreturn __ldg(&{place});\n#else\nreturn {place};\n#endif\n")
+        @wp.func_native(by_device(f"__ldg(&{place})", place))
         def read(values: wp.array(dtype=struct)) -> kind: ...
 
         return read
@@ -290,7 +289,7 @@ def writer(dtype):
 def fused(real):
     """Make a function of (a, b, c) that returns a b + c, with one rounding on GPUs; callers' bounds must cover both."""
 
-    @wp.func_native("#if defined(__CUDA_ARCH__)\nreturn fma(a, b, c);\n#else\nreturn a * b + c;\n#endif\n")
+    @wp.func_native(by_device("fma(a, b, c)", "a * b + c"))
     def multiply_add(a: real, b: real, c: real) -> real: ...
 
     return multiply_add
@@ -308,14 +307,8 @@ def fuses() -> bool: ...
 
 
 # Return whether the device is a GPU, which multiplies and adds at once.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return true;
-#else
-return false;
-#endif
-""")
-def fuses_on_gpu() -> bool: ...
+@wp.func_native(by_device("true", "false"))
+def on_gpu() -> bool: ...
 
 
 @functools.cache
@@ -323,7 +316,7 @@ def exact_fma(real):
     """Make a function of (a, b, c) that returns a b + c with one rounding; on some processors a slow call."""
     name = "__builtin_fma" if real == wp.float64 else "__builtin_fmaf"
 
-    @wp.func_native(f"#if defined(__CUDA_ARCH__)\nreturn fma(a, b, c);\n#else\nreturn {name}(a, b, c);\n#endif\n")
+    @wp.func_native(by_device("fma(a, b, c)", f"{name}(a, b, c)"))
     def multiply_add(a: real, b: real, c: real) -> real: ...
 
     return multiply_add
@@ -334,18 +327,12 @@ def log1p_of_gpu(real):
     """Make a function that returns log(1 + x) on a GPU; processors have none that compiled kernels may call."""
     name = "log1p" if real == wp.float64 else "log1pf"
 
-    @wp.func_native(f"#if defined(__CUDA_ARCH__)\nreturn {name}(x);\n#else\nreturn x;\n#endif\n")
+    @wp.func_native(by_device(f"{name}(x)", "x"))
     def log1p(x: real) -> real: ...
 
     return log1p
 
 
 # Return the number of bits that are set.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return __popc(bits);
-#else
-return __builtin_popcount(bits);
-#endif
-""")
+@wp.func_native(by_device("__popc(bits)", "__builtin_popcount(bits)"))
 def popcount(bits: wp.int32) -> wp.int32: ...

@@ -12,7 +12,6 @@ from .prelude import kernel, popcount, work_item
 from .reading_class import is_hit, is_max
 from .types import ReadingRules, measured, real, vec2
 
-# Max readings are left out, part of the constant term, or evaluated like others.
 ZERO = wp.float64(0.0)
 MISSING, FAR = wp.float64(math.nan), wp.float64(math.inf)
 
@@ -253,12 +252,12 @@ def place_inputs(
         )
 
 
-# Return reading k of a scan of ``head`` readings as a range, infinity for a max reading that counts, else nan.
 @wp.func
 def placed_value(
     k: wp.int32, before: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32),
     rules: ReadingRules,
 ):  # fmt: skip
+    """Return reading k of a scan as a range, infinity for a max reading that counts, else nan."""
     z = wp.float64(ranges[before + beam[k]])
     value = wp.float64(MISSING)
     if is_hit(z, rules.nearest, rules.farthest):
@@ -268,11 +267,11 @@ def placed_value(
     return value
 
 
-# Place the readings of scans of one particle each, all of them. One work-item takes a reading.
 @kernel
 def place_scans(
     ranges, beam, vector, point, point_low, reading, guard, scans, head, blocks, resolution, rules
 ):  # fmt: skip
+    """Place the readings of scans of one particle each, all of them. One work-item takes a reading."""
     item = work_item(wp.tid())
     scan = item // rules.beams
     if scan >= scans:

@@ -97,7 +97,6 @@ ON_PURPOSE = [
         "a kernel in OpenCL has its team's memory",
     ),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
-    Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),
     Purpose("icp_step", "log_share add_over_team add_joint_blocks", KERNELS_ONLY, TEAMS),
     Purpose("icp_step", "block_squares", REFERENCE_ONLY, ARRAYS),
     Purpose(

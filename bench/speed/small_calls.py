@@ -178,10 +178,8 @@ class Bench:
             def both(number: int) -> Any:
                 return model.log_likelihood(there, ranges[number % len(ranges)])
 
-            for words, short, long in (
-                ("on the device, out=", into, into), ("poses on the device", anew, anew),
-                ("poses and ranges on the device", both, anew),
-            ):  # fmt: skip
+            rows = {"on the device, out=": (into, into), "poses on the device": (anew, anew)}
+            for words, (short, long) in (rows | {"poses and ranges on the device": (both, anew)}).items():
                 self.add(f"{what}, {words}{label}", ways(short, functools.partial(long, one=plain)), kernels, count)
 
     def bound(

@@ -232,7 +232,7 @@ class PackedCallCache:
         size = (operands[0].shape[0], *kinds, operands[1].dtype)
         address = self._pipeline.backend.address
         at, readings = (None if one is None else address(one.buffer) for one in there)
-        # What changes is copied: scans more often than poses, and results that the user keeps.
+        # Copy only arrays that change: scans before poses, and results that the user keeps.
         pairs = dict.fromkeys([(at, readings), (at, None), (None, None)])
         for result in (address(target), None) if in_place else (None,):
             for pair in pairs:

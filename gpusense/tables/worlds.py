@@ -239,7 +239,6 @@ class Worlds:
         for stack in self.stacks(which):
             for table in self._tables.values():
                 table.fill(stack, table.buffer)
-        self.backend.synchronize()
         self.space.wait()
 
     def collides(

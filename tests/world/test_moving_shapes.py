@@ -213,6 +213,19 @@ def test_teams_of_gpus_find_the_shapes_of_few_and_many_rays(as_gpu: Any, backend
         np.testing.assert_allclose(found[1], found[0], rtol=0, atol=2e-6, err_msg=f"{rays} rays")
 
 
+def test_teams_of_gpus_share_more_pairs_than_they_mark_at_once(as_gpu: Any, backend: str) -> None:
+    """The circle around a long box contains the robots, so every ray may meet each box."""
+    angle, device, found = np.linspace(0, 6, 14), as_gpu(), []
+    boxes = np.column_stack([3 + np.cos(angle) * 2.5, 3 + np.sin(angle) * 2.5, angle + 1.6, 0 * angle + 6, 0.1 * angle])
+    poses = [(3.0, 3.0, 0.3), (3.2, 2.9, -2.0)]
+    for name in ("numpy", device):
+        worlds = gs.Worlds(np.zeros((1, 60, 60), np.int8), 0.1, backend=name)
+        worlds.shapes = gs.Shapes(boxes=boxes[None])
+        found.append(gs.RayCaster(worlds, RANGE, backend=name).cast(poses, np.linspace(-3, 3, 384)))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=2e-6)
+    assert (found[0] < 4).all() and (found[0] > 1).all()
+
+
 CASES = [
     (dict(discs=[[[3.0, 1.0, 1.0]]]), 3.0, "a disc that the ray grazes"),
     (dict(discs=[[[1.0, 0.0, 2.0]]]), 0.0, "inside a disc"),

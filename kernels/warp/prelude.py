@@ -35,9 +35,7 @@ _ONE_EACH = {"grid_stride": False} if "grid_stride" in inspect.signature(wp.kern
 # of the loops of their caller, and they are compiled once.
 apart = functools.partial(wp.func, inline=False) if "inline" in inspect.signature(wp.func).parameters else wp.func
 
-_module = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
-# Registers of each of the four parts of a GPU's multiprocessor.
-_REGISTERS = 1 << 14
+_module = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
 _FOLDER = Path(__file__).parent
 _IMPORTED = re.compile(r"^ *from (\.+)([\w.]*) import", re.MULTILINE)
 # Flags that choose types.
@@ -63,8 +61,8 @@ def kernel_of(name, flags):
 
 def typed(body, flags):
     """Return the kernel of a marked function."""
-    whole = KERNELS[body.__name__]
-    row, names = whole.arguments, tuple(inspect.signature(body).parameters)
+    row = KERNELS[body.__name__].arguments
+    names = tuple(inspect.signature(body).parameters)
     if names != tuple(argument.name for argument in row):
         raise TypeError(f"{body.__name__}: parameters must be those of its row, got {', '.join(names)}")
     types = _argument_types(flags) | {"entry": body.__globals__.get("ENTRY")}
@@ -72,9 +70,6 @@ def typed(body, flags):
         argument.name: types[argument.type] if argument.shape is None else wp.array(dtype=types[argument.type])
         for argument in row
     }
-    if whole.registers and "IN_TEAMS" in flags and "launch_bounds" in inspect.signature(wp.kernel).parameters:
-        warps = 4 * (_REGISTERS // (32 * whole.registers))
-        return _module(body, launch_bounds=(whole.team, 32 * warps // whole.team))
     return _module(body)
 
 

@@ -94,7 +94,7 @@ class Kernel:
     neighbours of the first axis as a vector has lanes. With IN_TEAMS the ``team`` work-items of a group share an item,
     with SMALL_TEAMS an eighth as many, so the first axis has as many work-items for each. ``apart`` says that no two of
     its arrays share memory, so a compiler need not reload arguments after a write. ``registers`` limits the registers
-    of a work-item of a team on NVIDIA's GPUs, so that more teams run at once; 0 sets no limit.
+    of a work-item of a team in NVIDIA's OpenCL, so that more teams run at once; 0 sets no limit.
     """
 
     file: str

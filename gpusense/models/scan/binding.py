@@ -37,7 +37,7 @@ class WaitingCall(BoundCall):
         if self.packed is not None:
             try:
                 with self._lock:
-                    if self.packed.score(*cast("tuple[Any, Any]", self._bound), self.out):
+                    if self.packed.score(*cast("tuple[Any, Any]", self._bound), self.out) is not None:
                         return self.out
             except MemoryError:
                 # This call would need the whole table of a changed map; the ordinary call needs only a part.

@@ -103,8 +103,11 @@ class PackedCall:
             out = backend.view(results.parts[0], (count,), real)
         self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, self._status, limits, corners)
 
-    def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> bool:
-        """Score poses; return False, and write no array of the host, if one is not finite."""
+    def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> Any:
+        """Score poses; return ``out``, or a new array of the host without it; None if a pose is not finite.
+
+        No array of the host is written where a pose is not finite.
+        """
         exchange = self._exchange
         exchange.begin()
         recording = self._recorded.recording(corners)
@@ -120,10 +123,13 @@ class PackedCall:
         status = results[self._flag].view(_INT)
         if status[0]:
             self._backend.upload(np.zeros(2, _INT), self._status)
-            return False
-        if self._in_host:
-            out[...] = results[self._log_p]
-        return True
+            return None
+        if not self._in_host:
+            return out
+        if out is None:
+            return results[self._log_p]
+        out[...] = results[self._log_p]
+        return out
 
     def shown(self, poses: Any, ranges: Any) -> tuple[Any, Any]:
         """Return the operands of the last call: copies of arrays of the host, readings in their type."""
@@ -192,14 +198,17 @@ class PackedCallCache:
                 # Without a range that depends on the pose, the constant term is rounded differently.
                 return None
         try:
-            result = None
+            result, target = None, None
             if not in_host or out is not None:
                 result = Result(poses, out, (count,), pipeline.real, pipeline.backend, on_device=not in_host)
-            target = np.empty(count, pipeline.real) if result is None else result.flat
+                target = result.flat
             # Libraries of CUDA reuse the memory of earlier results.
             in_place = not in_host and (out is not None or pipeline.backend.info.graphs)
             call = self._call((at, readings), target, corners, in_place=in_place)
-            if call is None or not call.score(at, readings, target, corners):
+            if call is None:
+                return None
+            scored = call.score(at, readings, target, corners)
+            if scored is None:
                 return None
         except MemoryError:
             # The buffers of both kinds of calls may not fit the device at once.
@@ -209,7 +218,7 @@ class PackedCallCache:
         self.last = functools.partial(call.shown, poses, ranges)
         if rules.first_scans.left:
             rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
-        return target if result is None else result.user_array()
+        return scored if result is None else result.user_array()
 
     def _operand(self, array: Any, name: str) -> np.ndarray | Adopted | None:
         """Return an array of the host or of the device; None if the ordinary call must read or refuse it."""

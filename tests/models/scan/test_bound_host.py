@@ -381,7 +381,7 @@ def test_a_recorded_call_that_reports_a_bad_pose_is_repeated_by_the_ordinary_one
     for seed in range(3):
         model.log_likelihood(cloud(seed), mixed(seed))
     assert model._short.last is not None
-    monkeypatch.setattr(packed_call.PackedCall, "score", lambda *arguments: False)
+    monkeypatch.setattr(packed_call.PackedCall, "score", lambda *arguments: None)
     for out in (None, np.full(COUNT, 7, np.float32)):
         assert (
             differing(model.log_likelihood(cloud(4), mixed(4), out=out), plain.log_likelihood(cloud(4), mixed(4))) == 0

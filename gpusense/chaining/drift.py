@@ -91,10 +91,10 @@ def _anchors_of(spread: Floats, most: int) -> Integers:
 
 
 def _reduced(matrix: Any, kept: Integers) -> Floats:
-    """Eliminate all poses but some ascending ones from sparse information; return the information of these.
+    """Eliminate all poses except ``kept``, which ascend, from sparse information; return the information of ``kept``.
 
-    Links join nearby poses of the chain. Every second stretch of poses is therefore eliminated, then every second one
-    of the rest, and so on; poses with a link to a farther stretch come last.
+    Links join nearby poses of the chain, so each round eliminates every second stretch of the remaining poses. Poses
+    with a link to a farther stretch are eliminated last.
     """
     blocks = _blocks_of(matrix)
     count = blocks.shape[0] // 3

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-# 1.5 * 2^52: adding it rounds to an integer, of either sign, which is in the last bits of the sum.
+# 1.5 * 2^52: adding it rounds a number of either sign to an integer, and leaves the integer in the last bits.
 ROUNDER = 6755399441055744.0
 # A quarter of a turn as the sum of two rounded numbers, and half a turn.
 QUARTER, QUARTER_LOW = 1.5707963267948966, 6.123233995736766e-17

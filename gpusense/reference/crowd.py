@@ -29,7 +29,7 @@ def find_sights(flags, shapes, world, pose_cell, pose, sights, particles, crowd)
 def meet_shapes(flags, shapes, world, pose_cell, pose, ray, turns, ranges, particles, rays, limit, crowd):
     """Find the distances of the nearest shapes along the rays of particles, ``limit`` where none is nearer.
 
-    ``ray`` has the rays in the order at the end of ``turns``. NumPy's rays test every shape.
+    ``ray`` lists the rays in the order at the end of ``turns``. NumPy's rays test every shape.
     """
     block, order = max((1 << 15) // max(rays, 1), 1), turns[DIRECTIONS + 1 : DIRECTIONS + 1 + rays]
     for first in range(0, particles, block):

@@ -81,7 +81,7 @@ def checked_origins(origin: Any, count: int) -> list[tuple[float, float, float]]
 def frames_of(
     origins: Sequence[tuple[float, float, float]], resolution: float, sizes: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Return the frames of worlds, whose tables begin at cells ``place`` (M,); see the kernel file ``placement``."""
+    """Return the frames (M, 8) of worlds; ``place`` (M,) is the first cell of each; see the file ``placement``."""
     frames = np.zeros((len(origins), 8))
     known: dict[tuple[float, float, float], tuple[float, ...]] = {}
     for number, origin in enumerate(origins):

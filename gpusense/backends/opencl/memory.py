@@ -204,7 +204,7 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
     contiguous = bool(array.flags.c_contiguous)
     buffer: Buffer = None
     if contiguous:
-        # An array of its own buffer, as most are, needs no query of the device.
+        # Only an array that begins inside its buffer needs the alignment, which the device must be asked for.
         alignment = alignment_of(queue.device) if array.offset else 1
         if array.offset % alignment and in_place:
             raise ValueError(

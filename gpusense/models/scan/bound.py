@@ -231,7 +231,7 @@ class RecordedCall(ReplayedCall):
         super().__init__(backend, pipeline.map, lock, placed, owners, array, self._space, chunk)
 
     def recording(self, corners: Corners | None = None) -> Recording:
-        """Return the recording for the present map; ``corners`` are those of the box of the poses."""
+        """Return the recording for the present map; ``corners`` bound the poses."""
         if corners is not None:
             self._poses.hull = corners
             self._pipeline.map.ensure(corners)
@@ -253,7 +253,7 @@ class RecordedCall(ReplayedCall):
         return recording, self._exchange[1]
 
     def columns(self, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the evaluated readings of (K,) readings, and those with a constant term, for ``terms``."""
+        """Return the indices of evaluated readings, and of max readings with a constant term, for ``terms``."""
         scans = self._pipeline.classed(ranges[None])
         return scans.columns, scans.left_out.constant_max
 

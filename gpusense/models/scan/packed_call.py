@@ -195,7 +195,7 @@ class PackedCallCache:
                 # The host inspects them.
                 ranges = pipeline.backend.download(readings.buffer, np.empty(size, readings.dtype))
             if pipeline.context.temperature < 1 and not classify_ranges(ranges, *rules.limits)[0].any():
-                # Without a range that depends on the pose, the constant term is rounded differently.
+                # The ordinary call rounds the constant term differently if no reading depends on the pose.
                 return None
         try:
             result, target = None, None

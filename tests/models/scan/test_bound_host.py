@@ -388,6 +388,16 @@ def test_a_recorded_call_that_reports_a_bad_pose_is_repeated_by_the_ordinary_one
         )
 
 
+def test_results_of_short_calls_keep_their_numbers(batching):
+    """Later calls write to memory of their own."""
+    model, plain = (gs.LikelihoodFieldModel(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    results = [model.log_likelihood(cloud(seed), mixed(seed)) for seed in range(6)]
+    assert model._short.last is not None
+    for seed, result in enumerate(results):
+        assert result.shape == (COUNT,) and result.flags.writeable
+        assert differing(result, plain.log_likelihood(cloud(seed), mixed(seed), per_beam=True)[0]) == 0
+
+
 def test_measured_savings_beside_another_thread_that_scores(batching, monkeypatch):
     """The thread's recorded call comes after the plan, and must not be waited for under the model's lock."""
     model, plan_of_call = FIELD(GRID, NEAR, backend=batching[0]), model_module.plan_of_call

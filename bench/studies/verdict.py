@@ -22,13 +22,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from common import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import recordings
 import verdict_runs as runs
-from common import make_parser, parse, publish
+from common import make_parser, parse, publish, table
 
 import gpusense as gs
 

@@ -211,3 +211,15 @@ def test_names_that_bench_imports_exist():
             if name not in known and not any((place / f"{name}.py").is_file() for place in places):
                 missing.append(f"{path.relative_to(ROOT)}: {module}.{name}")
     assert missing == []
+
+
+def test_bench_scripts_import_their_helpers_after_finding_them():
+    """A sorted import above ``sys.path.insert`` fails as soon as a script runs alone."""
+    helpers, early = {path.stem for path in (ROOT / "bench").glob("*.py")}, []
+    for path in sorted((ROOT / "bench").glob("*/*.py")):
+        text = path.read_text(encoding="utf-8")
+        found = text.find("sys.path.insert")
+        for name in re.finditer(r"^(?:from|import) (\w+)", text[: max(found, 0)], re.MULTILINE):
+            if name[1] in helpers:
+                early.append(f"{path.relative_to(ROOT)}: {name[1]}")
+    assert early == []

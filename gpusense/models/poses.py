@@ -46,9 +46,6 @@ class Poses:
     poses when their corners are asked for first.
     """
 
-    # Corners of the box of poses on the device, if their owner knows them; they affect only the table.
-    hull: Corners | None = None
-
     # The worlds of the poses; None in a single map.
     inside: WorldIndex | None = None
 
@@ -120,7 +117,7 @@ class Poses:
         self, reachable: ReachableMap, part: Part, backend: Backend, space: Workspace | None = None
     ) -> MapState:
         """Return the map with a table for some poses."""
-        return reachable.ensure(self.corners(part, backend, space) or self.hull)
+        return reachable.ensure(self.corners(part, backend, space))
 
     @property
     def sights(self) -> int:

@@ -28,7 +28,6 @@ from gpusense.models.scan.readings import Readings, device_readings, device_scan
 from gpusense.models.scan.scoring import terms_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.tables.world_index import WorldIndex
-from gpusense.world.windows import Corners
 
 _INT = np.dtype(np.int32)
 
@@ -187,9 +186,8 @@ class RecordedCall(ReplayedCall):
     """A call of ``log_likelihood``; see ``ReplayedCall``.
 
     ``status``: a buffer for the non-finite flag, which its owner inspects; ``limits``: type to which the scanner's
-    limits are rounded, by default the type of the ranges; ``corners``: of the box of the poses, to crop the
-    map's table; ``inside``: the worlds of the poses, in which ranges may be (N, K); ``per_beam``: whether to keep the
-    term of each reading.
+    limits are rounded, by default the type of the ranges; ``inside``: the worlds of the poses, in which ranges may be
+    (N, K); ``per_beam``: whether to keep the term of each reading.
     """
 
     def __init__(
@@ -201,7 +199,6 @@ class RecordedCall(ReplayedCall):
         out: Any,
         status: Buffer | None = None,
         limits: np.dtype | None = None,
-        corners: Corners | None = None,
         inside: WorldIndex | None = None,
         *,
         per_beam: bool = False,
@@ -209,7 +206,7 @@ class RecordedCall(ReplayedCall):
         backend, real = pipeline.backend, pipeline.real
         self._pipeline, self._per_beam = pipeline, per_beam
         placed = Poses(poses, backend, in_place=True)
-        placed.hull, placed.inside = corners, inside
+        placed.inside = inside
         own_scans = inside is not None and len(ranges.shape) == 2
         beams = pipeline.scanner.count
         shape = (placed.count, beams) if own_scans else (beams,)
@@ -230,11 +227,9 @@ class RecordedCall(ReplayedCall):
         owners = (poses, ranges, adopted, array)
         super().__init__(backend, pipeline.map, lock, placed, owners, array, self._space, chunk)
 
-    def recording(self, corners: Corners | None = None) -> Recording:
-        """Return the recording for the present map; ``corners`` bound the poses."""
-        if corners is not None:
-            self._poses.hull = corners
-            self._pipeline.map.ensure(corners)
+    @property
+    def recording(self) -> Recording:
+        """The recording for the present map."""
         return self._current().recording
 
     @property

@@ -307,7 +307,7 @@ class MapCaster:
     def _place(self, poses: Poses, part: Part, space: Workspace, cones: Cones = LASER) -> tuple[PlacedPoses, MapState]:
         """Place some poses in a window of the map; also return the map with its table."""
         corners = poses.corners(part, self.backend, space)
-        state = self.map.ensure(corners or poses.hull)
+        state = self.map.ensure(corners)
         sees = "CONES" in cones.flags
         return place(poses, part, state.frame, self.backend, space, self.real, corners, sees=sees), state
 

@@ -20,21 +20,19 @@ from gpusense.backends import arrays
 from gpusense.backends.arrays import FLOATS, Result
 from gpusense.backends.base import Adopted
 from gpusense.backends.workspace import Packed, RepeatCache
-from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import RecordedCall
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.scanner import classify_ranges
-from gpusense.world.windows import Corners
 
 # Largest size of the host's arrays that are copied with the launches [bytes]; longer ones take the ordinary call.
 LARGEST = 256 << 10
 # Largest map of which a short call makes the whole table [cells].
 MOST_CELLS = 1 << 22
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
-# Numbers of sizes and of places of short calls that are kept; ordinary calls before the first short one; and calls
-# after which places make room for others.
-_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE = 8, 16, 2, 4096
+# Numbers of sizes and of places of short calls that are kept; ordinary calls before the first short one; calls after
+# which places make room for others; and latest addresses of an argument that are known.
+_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE, _KNOWN = 8, 16, 2, 4096, 4
 
 
 def fits(poses: Any, readings: int) -> bool:
@@ -62,12 +60,12 @@ class PackedCall:
     Each of poses, ranges (``inputs``) and result (``out``) is None for an array of the host, a type for arrays of the
     device that are copied, or an array of the device that is used in place. Poses and readings of the host are float64
     on the device, exact for float32. Limits of readings are rounded to ``limits``, the precision of the readings, as on
-    the host. ``corners``: of the box of the first poses; None for the table of the whole map.
+    the host. The table is that of the whole map, so that no call needs the bounds of its poses.
     """
 
     def __init__(
         self, pipeline: ScanPipeline, lock: threading.Lock, count: int, inputs: tuple[Any, Any], out: Any,
-        limits: np.dtype | None, corners: Corners | None = None,
+        limits: np.dtype | None,
     ) -> None:  # fmt: skip
         backend = self._backend = pipeline.backend
         self._limits = limits
@@ -101,16 +99,16 @@ class PackedCall:
             out = backend.view(self._result[0], (count,), real)
         elif out is None:
             out = backend.view(results.parts[0], (count,), real)
-        self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, self._status, limits, corners)
+        self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, self._status, limits)
 
-    def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> Any:
+    def score(self, poses: Any, ranges: Any, out: Any) -> Any:
         """Score poses; return ``out``, or a new array of the host without it; None if a pose is not finite.
 
         No array of the host is written where a pose is not finite.
         """
         exchange = self._exchange
         exchange.begin()
-        recording = self._recorded.recording(corners)
+        recording = self._recorded.recording
         for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
             if type(slot) is tuple:
                 self._backend.copy(numbers.buffer, *slot)
@@ -162,6 +160,8 @@ class PackedCallCache:
         # Keyed by size and types; and by size, types and addresses of arrays in place.
         self._sizes = RepeatCache[PackedCall](_MOST_SIZES, _BEFORE)
         self._places = RepeatCache[PackedCall](_MOST_PLACES, _BEFORE, _PATIENCE)
+        # The latest addresses of poses, ranges and results.
+        self._known: tuple[list[int], ...] = ([], [], [])
         # A private lock, since the scoring thread holds the model's lock.
         self._lock = threading.Lock()
 
@@ -187,9 +187,6 @@ class PackedCallCache:
         if at is None or readings is None:
             return None
         in_host, rules = type(at) is np.ndarray, pipeline.rules
-        corners = self._corners(poses) if in_host else None
-        if in_host and corners is None:
-            return None
         if pipeline.context.temperature < 1 or rules.first_scans.left:
             if isinstance(readings, Adopted):
                 # The host inspects them.
@@ -204,10 +201,10 @@ class PackedCallCache:
                 target = result.flat
             # Libraries of CUDA reuse the memory of earlier results.
             in_place = not in_host and (out is not None or pipeline.backend.info.graphs)
-            call = self._call((at, readings), target, corners, in_place=in_place)
+            call = self._call((at, readings), target, in_place=in_place)
             if call is None:
                 return None
-            scored = call.score(at, readings, target, corners)
+            scored = call.score(at, readings, target)
             if scored is None:
                 return None
         except MemoryError:
@@ -234,33 +231,38 @@ class PackedCallCache:
         return adopted if adopted.dtype in FLOATS and adopted.strides is None else None
 
     def _call(
-        self, operands: tuple[np.ndarray | Adopted, np.ndarray | Adopted], target: Any, corners: Corners | None, *,
-        in_place: bool,
-    ) -> PackedCall | None:  # fmt: skip
+        self, operands: tuple[np.ndarray | Adopted, np.ndarray | Adopted], target: Any, *, in_place: bool
+    ) -> PackedCall | None:
         """Return the call of poses and ranges, recorded once it repeats; ``in_place``: whether results may be."""
         at, readings = operands
         if type(at) is np.ndarray and type(readings) is np.ndarray:
             key: tuple[Any, ...] = (at.shape[0], None, None, readings.dtype, None, None, None)
-            return self._sizes.found(key, functools.partial(self._recorded, key, [None, None], target, corners))
+            return self._sizes.found(key, functools.partial(self._recorded, key, [None, None], target))
         there = [None if isinstance(one, np.ndarray) else one for one in operands]
         kinds = [None if one is None else one.dtype for one in there]
-        size = (operands[0].shape[0], *kinds, operands[1].dtype)
-        address = self._pipeline.backend.address
-        places = tuple(None if one is None else address(one.buffer) for one in there)
-        # Copy only arrays that change: scans before poses, and results that the user keeps.
-        pairs = dict.fromkeys([places, (places[0], None), (None, None)])
-        for result in (address(target), None) if in_place else (None,):
-            for pair in pairs:
-                key = (*size, *pair, result)
-                cache = self._sizes if (*pair, result) == (None, None, None) else self._places
-                call = cache.found(key, functools.partial(self._recorded, key, there, target, corners))
-                if call is not None:
-                    return call
+        size = (at.shape[0], *kinds, readings.dtype)
+        buffers = [*(None if one is None else one.buffer for one in there), target if in_place else None]
+        # Copy arrays at addresses that change, such as new scans, and results that the user keeps.
+        places = tuple(map(self._place, buffers, self._known))
+        for key in dict.fromkeys([(*size, *places), (*size, None, None, None)]):
+            cache = self._places if any(key[-3:]) else self._sizes
+            call = cache.found(key, functools.partial(self._recorded, key, there, target))
+            if call is not None:
+                return call
         return None
 
-    def _recorded(
-        self, key: tuple[Any, ...], there: list[Adopted | None], target: Any, corners: Corners | None
-    ) -> PackedCall:
+    def _place(self, buffer: Any, known: list[int]) -> int | None:
+        """Return the address of an array that is used in place; None for one that is copied, and note its address."""
+        if buffer is None:
+            return None
+        address = self._pipeline.backend.address(buffer)
+        if address in known:
+            return address
+        known.append(address)
+        del known[:-_KNOWN]
+        return None
+
+    def _recorded(self, key: tuple[Any, ...], there: list[Adopted | None], target: Any) -> PackedCall:
         """Return a new call, which uses the arrays of the device in place that its key names."""
         count, *kinds, limits, at, readings, result = key
         view, real = self._pipeline.backend.view, self._pipeline.real
@@ -269,11 +271,4 @@ class PackedCallCache:
             for one, kind, place in zip(there, kinds, (at, readings), strict=True)
         ]
         out = None if there[0] is None else real if result is None else view(target, (count,), real)
-        return PackedCall(self._pipeline, self._lock, count, (inputs[0], inputs[1]), out, limits, corners)
-
-    def _corners(self, poses: np.ndarray) -> Corners | None:
-        """Return corners of the box of poses; None where one is not finite."""
-        low, high = arrays.bounds_of(np.asarray(poses, np.float64))
-        if not all(map(math.isfinite, (*low, *high))):
-            return None
-        return corners_of((low, high))
+        return PackedCall(self._pipeline, self._lock, count, (inputs[0], inputs[1]), out, limits)

@@ -271,7 +271,7 @@ class ScanPipeline(ABC):
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
         """Place some poses in a window of the map; also return the map with its table."""
         corners = poses.corners(part, self.backend, space)
-        state = self.map.ensure(corners or poses.hull)
+        state = self.map.ensure(corners)
         placed = place(
             poses, part, state.frame, self.backend, space, self.real, corners, careful=self.careful,
             sees=not self.end_points,

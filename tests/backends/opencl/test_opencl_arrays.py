@@ -144,6 +144,7 @@ def test_ordinary_calls_whose_arrays_repeat_copy_none(kind, as_gpu, queue, there
     for seed in range(6):
         poses.set(cloud(seed))
         ranges.set(mixed(seed))
+        copied.clear()
         assert model.log_likelihood(poses, ranges, out=out) is out
         assert differing(out.get(), plain.log_likelihood(poses, mixed(seed)).get()) == 0
     assert model._short.last is not None and not copied

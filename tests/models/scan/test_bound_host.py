@@ -11,6 +11,7 @@ from support.array_libraries import Array, to_device
 from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, NEAR, SCANS, cloud, mixed
 
 import gpusense as gs
+from gpusense.backends import arrays
 from gpusense.evaluation.tolerances import differing
 from gpusense.models.scan import binding, packed_call, savings
 from gpusense.models.scan import model as model_module
@@ -226,6 +227,7 @@ def test_arrays_whose_addresses_repeat_are_used_in_place(kind, there, batching, 
     for seed in range(6):
         poses.assign(cloud(seed))
         before = len(started)
+        copied.clear()
         model.log_likelihood(poses, ranges, out=out)
         assert seed < 4 or len(started) == before + 1
         assert differing(out.numpy(), plain.log_likelihood(cloud(seed), mixed(0))) == 0
@@ -417,3 +419,26 @@ def test_measured_savings_beside_another_thread_that_scores(batching, monkeypatc
     thread.start()
     thread.join(60)
     assert plans and plans[0].measured is not None
+
+
+def test_short_calls_need_no_bounds_of_the_poses(batching, monkeypatch):
+    """The table covers the whole map, and poses anywhere use it; a pose that is not finite is still named."""
+    grid = gs.OccupancyGrid(np.pad(GRID.cells, 100), 0.1)
+    model, plain = (FIELD(grid, NEAR, backend=batching[0]) for _ in range(2))
+    plain._short = None
+    for seed in range(3):
+        model.log_likelihood(cloud(seed) + 10.0, mixed(seed))
+    assert model._pipeline.map.window is model._pipeline.map._whole
+    bounds, counted = arrays.bounds_of, []
+    monkeypatch.setattr(arrays, "bounds_of", lambda poses: (counted.append(1), bounds(poses))[1])
+    version = model.table_version
+    for seed in range(3):
+        poses = cloud(seed)
+        poses[:, 1] += 5.0 * seed
+        found = model.log_likelihood(poses, mixed(seed))
+        assert not counted and model.table_version == version
+        assert differing(found, plain.log_likelihood(poses, mixed(seed))) == 0
+        counted.clear()
+    poses[7, 0] = np.inf
+    with pytest.raises(ValueError, match=r"poses: every value must be finite, got inf at index \(7, 0\)"):
+        model.log_likelihood(poses, mixed(0))

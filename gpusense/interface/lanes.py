@@ -88,6 +88,7 @@ def with_teams_flags(
 TYPES = {
     "real": "lanes",
     "real2": "LanePair",
+    "real4": "LaneQuad",
     "double": "doubles",
     "double2": "DoublePair",
     "long": "long8",
@@ -95,9 +96,7 @@ TYPES = {
     "as_double": "as_double8",
     "as_long": "as_long8",
 }
-_STRUCTS = {"real2", "double2"}
-# A real2 that is a sum of two numbers has its high part as x.
-_FIELDS = {"x": "hi", "y": "lo"}
+_STRUCTS = {"real2", "real4", "double2"}
 _WANTED = re.compile(r"^// in lanes: (.*)\n", re.MULTILINE)
 _DEFINED = re.compile(r"^\w[\w* ]*?[ *](\w+_lanes)[(;]", re.MULTILINE)
 # Lists the functions and types in lanes that a text defines.
@@ -162,13 +161,12 @@ def _words(text: str) -> frozenset[str]:
 @functools.lru_cache(maxsize=512)
 def _vectors(text: str, replaced: frozenset[str], numbers: bool) -> str:
     """Return a definition with vectors for ``numbers``, and with the forms in lanes of the names in ``replaced``."""
-    fields = _FIELDS if re.search(r"\breal2?\b", text) else {}
     types = TYPES if numbers else {}
 
     def word(match: re.Match[str]) -> str:
         dot, found, call = match.groups()
         if dot:
-            return dot + fields.get(found, found) + call
+            return match[0]
         # Structs have capitals; a variable may have the name of a function.
         is_replaced = found in replaced and (call or found[0].isupper())
         return (f"{found}_lanes" if is_replaced else types.get(found, found)) + call

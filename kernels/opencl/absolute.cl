@@ -21,16 +21,16 @@ real2 half_sine(const real2 residual) {
 
 // Return the log of the ratio of the sum over all turns to the normal of the nearest turn.
 real log_other_turns(const real2 residual, const real decay) {
-    const real size = fabs(residual.x), low = residual.x < 0 ? -residual.y : residual.y;
-    const real rest = fmax((HALF_TURN - size) + (HALF_TURN_LOW - low), (real)0);
+    const real size = residual.x < 0 ? -residual.x : residual.x, low = residual.x < 0 ? -residual.y : residual.y;
+    const real left = (HALF_TURN - size) + (HALF_TURN_LOW - low), rest = left > 0 ? left : (real)0;
     // For most headings the other turns add nothing.
-    if (decay * rest > NEGLIGIBLE) return 0;
+    if (!in_any(decay * rest <= NEGLIGIBLE)) return 0;
     real others = 0;
     for (int k = 1; k <= WRAPS; ++k) {
         others += exp(-decay * k * ((k - 1) * HALF_TURN + rest));
         others += exp(-decay * k * (k * HALF_TURN + size));
     }
-    return log_one_plus(others);
+    return decay * rest <= NEGLIGIBLE ? log_one_plus(others) : (real)0;
 }
 
 // Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence; waves are 2 q^(n n).

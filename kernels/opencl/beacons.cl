@@ -11,7 +11,7 @@ real log_normal(const real2 residual, const real near, const real far, const rea
     const real below = near * scale.x, above = far * scale.x;
     const real2 exponent = bounded_square(pair_product(residual, scale));
     const real untruncated = (peak.x - exponent.x) + (peak.y - exponent.y);
-    if (below > ERF_ONE && above > ERF_ONE) return untruncated;
+    if (!in_any((below < ERF_ONE) | (above < ERF_ONE))) return untruncated;
     return untruncated - log((real)0.5 * (erf(below) + erf(above)));
 }
 
@@ -39,7 +39,8 @@ real log_student_t(const real2 residual, const real near, const real far, global
 real log_range(const real2 d, global const real *beacon, global const BeaconTerms *terms, global const real *series,
                const int count, const int kind) {
     const real2 first = two_sum(d.x, -beacon[4]), r = two_sum(first.x, first.y + (d.y - beacon[5]));
-    const real near = clamp(d.x + beacon[6], (real)0, terms->range_max), far = terms->range_max - near;
+    const real mean = d.x + beacon[6], above = mean > 0 ? mean : (real)0, most = terms->range_max;
+    const real near = above < most ? above : most, far = most - near;
     real log_p;
     if (kind == STUDENT_T)
         log_p = log_student_t(r, near, far, terms, series, count);

@@ -75,9 +75,9 @@ real2 angle_pair(const real2 side, const real2 ahead, global const real2 *arcs) 
 #if RANGE
 // Return the mass of the normal around d on [0, range_max]; d is clamped to range_max.
 real range_mass(const real2 d, const real scale, global const FeatureTerms *terms) {
-    const real below = fmin(d.x, terms->range_max) * scale;
-    const real above = fmax((terms->range_max - d.x) + (terms->range_max_low - d.y), (real)0) * scale;
-    if (below > ERF_ONE && above > ERF_ONE) return 1;
+    const real most = terms->range_max, left = (most - d.x) + (terms->range_max_low - d.y);
+    const real below = (d.x < most ? d.x : most) * scale, above = (left > 0 ? left : (real)0) * scale;
+    if (!in_any((below < ERF_ONE) | (above < ERF_ONE))) return 1;
     return (real)0.5 * (erf(below) + erf(above));
 }
 #endif

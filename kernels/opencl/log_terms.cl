@@ -1,10 +1,15 @@
 // Offsets between places, and exponents and logarithms of densities of sensors other than scanners; see the reference.
 // requires: error_free
 
-// Return the offset from a sensor to a landmark or beacon (x, y, and the low parts of both).
+// Return whether a comparison holds; in lanes, whether it holds in any lane.
+int in_any(const int holds) { return holds; }
+
+// Return the offset from a sensor to a landmark or beacon (x, its low part, y, its low part).
 real4 offset(const real4 landmark, const real4 place) {
-    const real2 x = two_sum(landmark.x, -place.x), y = two_sum(landmark.y, -place.z);
-    return (real4)(two_sum(x.x, x.y + (landmark.z - place.y)), two_sum(y.x, y.y + (landmark.w - place.w)));
+    const real2 first_x = two_sum(landmark.x, -place.x), first_y = two_sum(landmark.y, -place.z);
+    const real2 x = two_sum(first_x.x, first_x.y + (landmark.z - place.y));
+    const real2 y = two_sum(first_y.x, first_y.y + (landmark.w - place.w));
+    return (real4)(x.x, x.y, y.x, y.y);
 }
 
 // Return the length of an offset: the rounded root, and the correction of one step of Newton's method.
@@ -21,8 +26,9 @@ real2 distance_pair(const real4 off) {
 
 // Return the square of a sum of two numbers; roots are clamped, so that nothing becomes infinite.
 real2 bounded_square(const real2 u) {
-    const real2 held = fabs(u.x) > LARGEST_ROOT ? (real2)(LARGEST_ROOT, 0) : u;
-    return pair_product(held, held);
+    const real size = u.x < 0 ? -u.x : u.x, most = LARGEST_ROOT;
+    const real high = size > most ? most : u.x, low = size > most ? (real)0 : u.y;
+    return pair_product((real2)(high, low), (real2)(high, low));
 }
 
 // Return log(1 + x) for x > -1.
@@ -30,6 +36,6 @@ real log_one_plus(const real x) { return log1p(x); }
 
 // Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
 real either(const real a, const real b) {
-    const real high = fmax(a, b), low = fmin(a, b);
-    return isinf(high) ? high : high + log_one_plus(exp(low - high));
+    const real high = a > b ? a : b, low = a > b ? b : a;
+    return high > -INFINITY ? high + log_one_plus(exp(low - high)) : high;
 }

@@ -70,9 +70,9 @@ def test_numbers_become_vectors():
 
 def test_calls_are_those_of_functions_in_lanes():
     line = "lanes twice_lanes(const lanes a) { return exp_lanes(two_sum_lanes(a, a)"
-    assert f"{line}.hi) + a; }}\n" in lanes_of("two_sum twice")
+    assert f"{line}.x) + a; }}\n" in lanes_of("two_sum twice")
     alone = lanes_of("twice", "lanes unrelated(const lanes a) { return a; }\n")
-    assert "exp_lanes(two_sum(a, a).hi)" in alone
+    assert "exp_lanes(two_sum(a, a).x)" in alone
     assert alone.startswith("lanes unrelated") and '#line 3 "lanes/one.cl"' in alone
 
 

@@ -106,6 +106,7 @@ ON_PURPOSE = [
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
     Purpose("line_fit", "line_at", KERNELS_ONLY, ARRAYS),
+    Purpose("log_terms", "in_any", (OPENCL,), LANES),
     Purpose("motion", "any_of motion_of move_by", (OPENCL,), LANES),
     Purpose("beam_consistency", "floor_of", (OPENCL,), FLOOR),
     Purpose("beam_consistency", "walkers", (WARP,), "OpenCL has get_local_size"),

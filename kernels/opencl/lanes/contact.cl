@@ -46,38 +46,38 @@ ilanes look_up_lanes(global const int *table, const Particles *particle, const r
 
 LanePair gap_lanes(const ilanes squared, global const ContactTerms *terms) {
     const LanePair whole = two_sum_lanes(to_lanes(squared >> 12) * 4096, to_lanes(squared & 4095));
-    const lanes d = sqrt(whole.hi);
-    const LanePair dd = fused_product_lanes(d, d);
-    const lanes low = d > 0 ? ((whole.hi - dd.hi) + (whole.lo - dd.lo)) / (2 * d) : (lanes)0;
+    const lanes d = sqrt(whole.x);
+    const LanePair dd = two_product_lanes(d, d);
+    const lanes low = d > 0 ? ((whole.x - dd.x) + (whole.y - dd.y)) / (2 * d) : (lanes)0;
     const ilanes none = squared == NO_OBSTACLE;
     const LanePair cells = {none ? (lanes)FAR_CELLS : d, none ? (lanes)0 : low};
-    const LanePair away = scaled_pair_lanes(cells, terms->side, terms->side_low);
-    const LanePair left = two_sum_lanes(away.hi, (lanes)-terms->reach);
-    return two_sum_lanes(left.hi, left.lo + (away.lo - terms->reach_low));
+    const LanePair away = pair_product_lanes(cells, (LanePair){terms->side, terms->side_low});
+    const LanePair left = two_sum_lanes(away.x, (lanes)-terms->reach);
+    return two_sum_lanes(left.x, left.y + (away.y - terms->reach_low));
 }
 
 // Return log(erfc(x) / 2) for x >= 0, by an asymptotic series where erfc is small.
 lanes log_above_lanes(const LanePair x) {
-    const ilanes large = x.hi >= LARGE;
-    const lanes b = large ? (lanes)LARGE : x.hi;
+    const ilanes large = x.x >= LARGE;
+    const lanes b = large ? (lanes)LARGE : x.x;
     lanes above = log_erfc_lanes(b) - LOG_TWO;
     if (any_lane(large)) {
-        const lanes t = 0.5f / (x.hi * x.hi);
+        const lanes t = 0.5f / (x.x * x.x);
         lanes series = 1;
         for (int n = SERIES; n > 0; --n) series = 1 - (2 * n - 1) * t * series;
         const LanePair square = bounded_square_lanes(x);
-        const lanes far = -square.hi - (log_lanes((large ? x.hi : (lanes)1) / (large ? series : (lanes)1)) +
-                                        (LOG_TWO_ROOT_PI + square.lo));
+        const lanes far = -square.x - (log_lanes((large ? x.x : (lanes)1) / (large ? series : (lanes)1)) +
+                                        (LOG_TWO_ROOT_PI + square.y));
         above = large ? far : above;
     }
     return above;
 }
 
 lanes log_bump_lanes(const ilanes squared, const int pressed, global const ContactTerms *terms) {
-    const LanePair x = scaled_pair_lanes(gap_lanes(squared, terms), terms->scale, terms->scale_low);
-    const ilanes overlaps = x.hi < 0;
+    const LanePair x = pair_product_lanes(gap_lanes(squared, terms), (LanePair){terms->scale, terms->scale_low});
+    const ilanes overlaps = x.x < 0;
     // The smaller of the two probabilities, then the other one.
-    const LanePair size = {overlaps ? -x.hi : x.hi, overlaps ? -x.lo : x.lo};
+    const LanePair size = {overlaps ? -x.x : x.x, overlaps ? -x.y : x.y};
     const lanes small = log_above_lanes(size), large = log_lanes(1 - exp_lanes(small));
     const lanes touching = overlaps ? large : small, clear = overlaps ? small : large;
     const real hit = pressed ? terms->log_contact : terms->log_missed;

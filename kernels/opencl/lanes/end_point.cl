@@ -7,19 +7,19 @@ ilanes within_lanes(const ilanes i, const int last) {
 }
 
 ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_next) {
-    const lanes up = offset.hi + (real)0.5;
+    const lanes up = offset.x + (real)0.5;
     ilanes nearest = to_ilanes(up);
     nearest += to_lanes(nearest) > up;
 #if EXACT_EXPONENT
-    const LanePair past = two_sum_lanes(offset.hi - to_lanes(nearest), offset.lo);
-    const LanePair less = {past.hi < 0 ? past.hi : -past.hi, past.hi < 0 ? past.lo : -past.lo};
-    const LanePair sum = ordered_sum_lanes((lanes)1, less.hi), other = ordered_sum_lanes(sum.hi, sum.lo + less.lo);
+    const LanePair past = two_sum_lanes(offset.x - to_lanes(nearest), offset.y);
+    const LanePair less = {past.x < 0 ? past.x : -past.x, past.x < 0 ? past.y : -past.y};
+    const LanePair sum = ordered_sum_lanes((lanes)1, less.x), other = ordered_sum_lanes(sum.x, sum.y + less.y);
 #else
-    const lanes left = (offset.hi - to_lanes(nearest)) + offset.lo;
+    const lanes left = (offset.x - to_lanes(nearest)) + offset.y;
     const LanePair past = {left, 0}, other = {left < 0 ? 1 + left : 1 - left, 0};
 #endif
-    const ilanes below = past.hi + EDGE < 0;
-    *rest = (LanePair){below ? other.hi : past.hi, below ? other.lo : past.lo};
-    *to_next = (LanePair){below ? -past.hi : other.hi, below ? -past.lo : other.lo};
+    const ilanes below = past.x + EDGE < 0;
+    *rest = (LanePair){below ? other.x : past.x, below ? other.y : past.y};
+    *to_next = (LanePair){below ? -past.x : other.x, below ? -past.y : other.y};
     return nearest + below;
 }

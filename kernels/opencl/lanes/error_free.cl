@@ -3,22 +3,16 @@
 
 // A sum of two numbers in each lane.
 typedef struct {
-    lanes hi, lo;
+    lanes x, y;
 } LanePair;
 
-// in lanes: two_sum ordered_sum high_half two_product pair_sum pair_product
-
-// Return a * b = hi + lo by a fused multiply-add.
-LanePair fused_product_lanes(const lanes a, const lanes b) {
-    const lanes product = a * b;
-    return (LanePair){product, fma(a, b, -product)};
-}
+// in lanes: two_sum ordered_sum high_half two_product pair_sum pair_product add_term
 
 // Return c - a b, where c is a b rounded or nearly so.
 lanes rest_lanes(const lanes a, const lanes b, const lanes c) {
     if (FUSES) return fma(-a, b, c);
     const LanePair product = two_product_lanes(a, b);
-    return (c - product.hi) - product.lo;
+    return (c - product.x) - product.y;
 }
 
 // Return a b + c, rounded once where the device has a fused multiply-add.

@@ -70,7 +70,7 @@ kernel void field_gradient(ARGUMENTS) {
         const lanes distance = low + rest_y * slope_y;
         const lanes square = distance * (distance * terms->square_scale);
 #if HIT
-        const lanes hit = peak * exp_lanes(-shape_exponent_lanes((LanePair){square, 0}, power, rate).hi);
+        const lanes hit = peak * exp_lanes(-shape_exponent_lanes((LanePair){square, 0}, power, rate).x);
 #else
         const lanes hit = 0;
 #endif

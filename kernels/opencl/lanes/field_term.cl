@@ -11,16 +11,16 @@ lanes log_square_lanes(const LanePair square, global const FieldTerms *terms) {
 #if LINEAR
     lanes p = terms->rand_density;
 #if HIT
-    const lanes hit = terms->hit_peak * exp_lanes(-exponent.hi);
+    const lanes hit = terms->hit_peak * exp_lanes(-exponent.x);
 #if EXACT_EXPONENT
-    p += hit > 0 ? hit * (1 - exponent.lo) : hit;
+    p += hit > 0 ? hit * (1 - exponent.y) : hit;
 #else
     p += hit;
 #endif
 #endif
     return log_lanes(p);
 #else
-    const lanes hit = (terms->hit_peak - exponent.hi) + (terms->hit_peak_low - exponent.lo);
+    const lanes hit = (terms->hit_peak - exponent.x) + (terms->hit_peak_low - exponent.y);
 #if RAND
     const lanes random = terms->rand_density;
     const lanes largest = hit > random ? hit : random;
@@ -77,7 +77,7 @@ LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair
 #if EXACT_EXPONENT
     return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
 #else
-    return (LanePair){weight_a.hi * a.hi + weight_b.hi * b.hi, 0};
+    return (LanePair){weight_a.x * a.x + weight_b.x * b.x, 0};
 #endif
 }
 
@@ -90,15 +90,15 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
     for (int k = 0; k < size; ++k) {
         const lane_int *at = (const lane_int *)&ends->cell[k];
         LanePair a = {0, 0}, b = {0, 0}, c = {0, 0}, d = {0, 0};
-        gather_pairs(table, at, &a.hi, &b.hi);
-        gather_pairs(table + window.cols + 2 * FIELD_RING, at, &c.hi, &d.hi);
+        gather_pairs(table, at, &a.x, &b.x);
+        gather_pairs(table + window.cols + 2 * FIELD_RING, at, &c.x, &d.x);
         const LanePair low = between_lanes(ends->to_next_x[k], a, ends->rest_x[k], b);
         const LanePair high = between_lanes(ends->to_next_x[k], c, ends->rest_x[k], d);
         const LanePair distance = between_lanes(ends->to_next_y[k], low, ends->rest_y[k], high);
 #if EXACT_EXPONENT
         square[k] = pair_product_lanes(pair_product_lanes(distance, distance), scale);
 #else
-        square[k] = (LanePair){distance.hi * (distance.hi * terms->square_scale), 0};
+        square[k] = (LanePair){distance.x * (distance.x * terms->square_scale), 0};
 #endif
     }
 }

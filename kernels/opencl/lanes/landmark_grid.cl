@@ -26,10 +26,10 @@ void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p,
 #if MARGINAL
     const ilanes taken = seen & (log_p > -INFINITY), larger = taken & (log_p > match->log_p + RELATIVE);
     const lanes other = exp_lanes(larger ? match->log_p - log_p : log_p - match->log_p);
-    const LanePair more = two_sum_lanes(match->sum.hi, other);
-    const lanes high = larger ? match->sum.hi * other + 1 : more.hi;
-    const lanes low = larger ? match->sum.lo * other : match->sum.lo + more.lo;
-    match->sum = (LanePair){taken ? high : match->sum.hi, taken ? low : match->sum.lo};
+    const LanePair more = two_sum_lanes(match->sum.x, other);
+    const lanes high = larger ? match->sum.x * other + 1 : more.x;
+    const lanes low = larger ? match->sum.y * other : match->sum.y + more.y;
+    match->sum = (LanePair){taken ? high : match->sum.x, taken ? low : match->sum.y};
     match->log_p = larger ? log_p : match->log_p;
 #endif
 #if PER_BEAM
@@ -45,11 +45,11 @@ void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p,
 // Return the lanes in which a landmark at an offset may be likelier than the best so far. The error of the range and
 // the sine of the bearing's error bound the exponent from below; margins cover rounding errors, and landmarks without a
 // bearing at zero range.
-ilanes may_be_likelier(const LanePlace off, const lanes d, const LanePlace turned, const lanes best,
+ilanes may_be_likelier(const LaneQuad off, const lanes d, const LaneQuad turned, const lanes best,
                        global const real *feature) {
     const float at = feature[RANGE_AT];
     const lanes rest = feature[MOST] - best, beyond = d - at;
-    const lanes side = turned.x.hi * off.y.hi - turned.y.hi * off.x.hi;
+    const lanes side = turned.x * off.z - turned.z * off.x;
     const lanes away = (beyond < 0 ? -beyond : beyond) - 1e-6f * (d + at), across = (side < 0 ? -side : side) - 1e-6f * d;
     const lanes r = (away > 0 ? away : (lanes)0) * feature[RANGE_SCALE];
     const lanes b = (across > 0 ? across : (lanes)0) * feature[BEARING_SCALE] / d;
@@ -60,7 +60,7 @@ ilanes may_be_likelier(const LanePlace off, const lanes d, const LanePlace turne
 // Update the matches by landmark j, where it is in a feature's disc, within the limits of the sensor that the feature
 // does not measure, and may be likelier than the best so far.
 void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature, const int j,
-                         const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
+                         const LaneQuad place, const LaneQuad turned, const lanes end_x, const lanes end_y,
                          global const real *feature, global const FeatureTerms *terms) {
     // The disc has room for these rounding errors.
     const real4 here = landmark[j];
@@ -68,12 +68,12 @@ void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global
     const lanes apart = apart_x * apart_x + apart_y * apart_y;
     if (!any_lane(apart <= match->most)) return;
     const float hole = feature[HOLE] * feature[HOLE], farthest = feature[FARTHEST] * feature[FARTHEST];
-    const LanePlace off = offset_lanes(here, place);
-    const lanes squared = off.x.hi * off.x.hi + off.y.hi * off.y.hi;
+    const LaneQuad off = offset_lanes(in_all_lanes(here), place);
+    const lanes squared = off.x * off.x + off.z * off.z;
     ilanes seen = (apart <= match->most) & (squared >= hole) & (squared <= farthest);
     const lanes d = sqrt(squared);
 #if FIELD
-    seen &= turned.x.hi * off.x.hi + turned.y.hi * off.y.hi >= feature[AXIS] * d;
+    seen &= turned.x * off.x + turned.z * off.z >= feature[AXIS] * d;
 #endif
 #if !MARGINAL
     seen &= may_be_likelier(off, d, turned, match->best, feature);
@@ -109,7 +109,7 @@ int is_beyond(const real4 here, const real2 x, const real2 y, const float square
 // depend on the other lanes.
 void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature,
                           global const int *start, const int4 buckets, const int cols, const real2 x, const real2 y,
-                          const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
+                          const LaneQuad place, const LaneQuad turned, const lanes end_x, const lanes end_y,
                           global const real *feature, global const FeatureTerms *terms) {
     const float squared_radius = feature[RADIUS] * feature[RADIUS];
     int nearest = -1;
@@ -139,12 +139,12 @@ void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, globa
 // Return the matches of a feature. Where the discs of all particles touch few more buckets together than each disc
 // alone, the particles search together, else one after the other. A lane has the same bits in both cases.
 MatchLanes search_lanes(global const real4 *landmark, global const real4 *signature, global const int *start,
-                        const LanePlace place, const LanePlace turned, global const real *feature,
+                        const LaneQuad place, const LaneQuad turned, global const real *feature,
                         global const FeatureTerms *terms, const Buckets buckets) {
     const real radius = feature[RADIUS];
     MatchLanes match = {-INFINITY, -INFINITY, -1, -1, {0, 0}};
     if (radius < 0) return match;
-    const lanes end_x = place.x.hi + feature[REACH] * turned.x.hi, end_y = place.y.hi + feature[REACH] * turned.y.hi;
+    const lanes end_x = place.x + feature[REACH] * turned.x, end_y = place.z + feature[REACH] * turned.z;
     const real2 x = ends_of_lanes(end_x), y = ends_of_lanes(end_y);
     const int4 all = touched_buckets(x, y, radius, buckets);
     const int across = min((int)(2 * fmin(radius, buckets.size * buckets.cols) / buckets.size) + 2, buckets.cols);
@@ -170,7 +170,7 @@ MatchLanes search_lanes(global const real4 *landmark, global const real4 *signat
 #if MARGINAL
     const ilanes any_found = match.log_p > -INFINITY;
     if (any_lane(any_found)) {
-        const lanes sum = match.sum.hi + match.sum.lo;
+        const lanes sum = match.sum.x + match.sum.y;
         match.log_p = any_found ? match.log_p + log_lanes(any_found ? sum : (lanes)1) : match.log_p;
     }
 #else

@@ -13,8 +13,10 @@ kernel void score_features(ARGUMENTS) {
         p[0][i] = place.x, p[1][i] = place.y, p[2][i] = place.z, p[3][i] = place.w;
         p[4][i] = high.z, p[5][i] = low.z, p[6][i] = high.w, p[7][i] = low.w;
     }
-    const LanePlace place = {{load_lanes(0, p[0]), load_lanes(0, p[1])}, {load_lanes(0, p[2]), load_lanes(0, p[3])}};
-    const LanePlace heading = {{load_lanes(0, p[4]), load_lanes(0, p[5])}, {load_lanes(0, p[6]), load_lanes(0, p[7])}};
+    const LaneQuad place = {load_lanes(0, p[0]), load_lanes(0, p[1]), load_lanes(0, p[2]), load_lanes(0, p[3])};
+    // Directions depend on the headings alone.
+    const LaneQuad heading = {0, 0, load_lanes(0, p[4]), load_lanes(0, p[6])};
+    const LaneQuad heading_low = {0, 0, load_lanes(0, p[5]), load_lanes(0, p[7])};
     LanePair total = {(lanes)score.constant_term, (lanes)0};
     ilanes impossible = isinf(score.constant_term) ? -1 : 0;
     for (int first = 0; first < features; first += BLOCK_TERMS) {
@@ -22,7 +24,7 @@ kernel void score_features(ARGUMENTS) {
         lanes block = 0;
         for (int k = first; k < last; ++k) {
             global const real *numbers = feature + FEATURE * k;
-            const LanePlace turned = direction_lanes(heading, numbers);
+            const LaneQuad turned = direction_lanes(heading, heading_low, numbers);
 #if KNOWN
             const int j = partner[k];
 #if SIGNATURE
@@ -31,7 +33,7 @@ kernel void score_features(ARGUMENTS) {
             const real4 known = 0;
 #endif
             const lanes detected =
-                log_detection_lanes(offset_lanes(landmark[j], place), turned, numbers, known, terms);
+                log_detection_lanes(offset_lanes(in_all_lanes(landmark[j]), place), turned, numbers, known, terms);
 #else
             const MatchLanes match =
                 search_lanes(landmark, signature, start, place, turned, numbers, terms, buckets);
@@ -54,10 +56,9 @@ kernel void score_features(ARGUMENTS) {
             impossible |= zero;
             block += zero ? (lanes)0 : value;
         }
-        const LanePair sum = two_sum_lanes(total.hi, block);
-        total = (LanePair){sum.hi, total.lo + sum.lo};
+        total = add_term_lanes(total, block);
     }
-    const lanes all = impossible ? (lanes)-INFINITY : score.temperature * (total.hi + total.lo);
+    const lanes all = impossible ? (lanes)-INFINITY : score.temperature * (total.x + total.y);
     store_some(all, log_p + first_particle, particles - first_particle);
 }
 
@@ -67,7 +68,7 @@ kernel void score_features(ARGUMENTS) {
 // Return the high parts of the offsets from a sensor to landmarks.
 lanes offset_to_lanes(const lanes landmark, const lanes landmark_low, const real place, const real place_low) {
     const LanePair sum = two_sum_lanes(landmark, (lanes)-place);
-    return sum.hi + (sum.lo + (landmark_low - place_low));
+    return sum.x + (sum.y + (landmark_low - place_low));
 }
 
 // The place of a particle's sensor, the axis of its view, and the buckets in its range: first and last column, then
@@ -90,10 +91,10 @@ Viewer viewer_of(const int2 cell, const real4 high, const real4 low, const Bucke
 }
 
 // Return the lanes of landmarks in view that belong to no feature, as -1; indices are landmark indices.
-ilanes unseen_lanes(const Viewer *viewer, const LanePlace at, const ilanes index, global const int *which,
+ilanes unseen_lanes(const Viewer *viewer, const LaneQuad at, const ilanes index, global const int *which,
                     const int features, const SensorView view) {
-    const lanes x = offset_to_lanes(at.x.hi, at.y.hi, viewer->place.x, viewer->place.y);
-    const lanes y = offset_to_lanes(at.x.lo, at.y.lo, viewer->place.z, viewer->place.w);
+    const lanes x = offset_to_lanes(at.x, at.z, viewer->place.x, viewer->place.y);
+    const lanes y = offset_to_lanes(at.y, at.w, viewer->place.z, viewer->place.w);
     const lanes d = sqrt(x * x + y * y);
     ilanes missed = d <= view.range_max;
 #if FIELD
@@ -127,7 +128,7 @@ kernel void count_unseen(ARGUMENTS) {
             const int last = start[to * buckets.cols + seen.y + 1];
             for (int j = start[row * buckets.cols + seen.x]; j < last; j += LANES) {
                 // A landmark has its low parts behind both coordinates.
-                const LanePlace at = load_places(landmark, j, count);
+                const LaneQuad at = load_places(landmark, j, count);
                 const ilanes index = lane + j, there = index < last;
                 for (int i = from; i < until; ++i)
                     unseen[i] -= there & unseen_lanes(&viewer[i], at, index, which + (long)(first + i) * features,

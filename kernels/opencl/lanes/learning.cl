@@ -24,7 +24,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     const lanes mass = mass_within_lanes(mean, above, terms->erf_scale, terms, masses, 0, &within);
     const lanes off = z - mean;
     const LanePair exponent = shape_exponent_lanes((LanePair){off * (off * terms->square_scale), 0}, power, rate);
-    lanes hit = terms->hit_peak - exponent.hi + (terms->hit_peak_low - exponent.lo);
+    lanes hit = terms->hit_peak - exponent.x + (terms->hit_peak_low - exponent.y);
     if (!within) hit -= log_lanes(mass);
     const lanes length = short_length_lanes(expected, terms, 0);
     lanes shorter = terms->z_short - log_lanes(length) - terms->lambda_short * z;

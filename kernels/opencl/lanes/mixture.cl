@@ -42,7 +42,7 @@ INLINE lanes mean_range_lanes(const lanes expected, global const MixtureTerms *t
 INLINE lanes above_mean_lanes(const lanes expected, const int any_clamped, global const MixtureTerms *terms, const ilanes bin_at) {
 #if BIAS
     const LanePair last = two_sum_lanes((lanes)terms->range_max, -(lanes)(TERM(range_bias)));
-    const lanes above = (last.hi - expected) + (last.lo - TERM(range_bias_low));
+    const lanes above = (last.x - expected) + (last.y - TERM(range_bias_low));
     if (any_clamped) {
         const lanes raised = above < 0 ? (lanes)0 : above;
         return raised > terms->range_max ? (lanes)terms->range_max : raised;
@@ -81,11 +81,11 @@ INLINE LanePair hit_offset_lanes(const lanes z, const lanes expected, const lane
                                  global const MixtureTerms *terms, const ilanes bin_at) {
 #if BIAS
     const LanePair unbiased = two_sum_lanes(z, -TERM(range_bias));
-    LanePair off = ordered_sum_lanes(unbiased.hi - expected, unbiased.lo - TERM(range_bias_low));
+    LanePair off = ordered_sum_lanes(unbiased.x - expected, unbiased.y - TERM(range_bias_low));
     if (any_clamped) {
         const ilanes clamped = is_clamped_lanes(mean, expected, terms, bin_at);
-        off.hi = clamped ? z - mean : off.hi;
-        off.lo = clamped ? (lanes)0 : off.lo;
+        off.x = clamped ? z - mean : off.x;
+        off.y = clamped ? (lanes)0 : off.y;
     }
     return off;
 #else
@@ -98,29 +98,29 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
     LanePair off = hit_offset_lanes(z, expected, mean, any_clamped, terms, bin_at);
 #if EXACT_EXPONENT
 #if GROWTH
-    const LanePair scaled = two_product_lanes(off.hi, scale.hi);
-    off.lo = multiply_add_lanes(off.lo, scale.hi, multiply_add_lanes(scaled.hi, scale.lo, scaled.lo));
-    off.hi = scaled.hi;
+    const LanePair scaled = two_product_lanes(off.x, scale.x);
+    off.y = multiply_add_lanes(off.y, scale.x, multiply_add_lanes(scaled.x, scale.y, scaled.y));
+    off.x = scaled.x;
 #endif
-    LanePair square = two_product_lanes(off.hi, off.hi);
+    LanePair square = two_product_lanes(off.x, off.x);
 #if BIAS
-    square.lo = multiply_add_lanes(2 * off.hi, off.lo, square.lo);
+    square.y = multiply_add_lanes(2 * off.x, off.y, square.y);
 #elif GROWTH
-    square.lo = multiply_add_lanes(2 * off.hi, off.lo, square.lo);
+    square.y = multiply_add_lanes(2 * off.x, off.y, square.y);
 #endif
-    const LanePair product = two_product_lanes(square.hi, TERM(square_scale));
+    const LanePair product = two_product_lanes(square.x, TERM(square_scale));
 #if GROWTH
-    const lanes rest = multiply_add_lanes(square.hi, TERM(square_scale_low), product.lo);
-    return (LanePair){product.hi, multiply_add_lanes(square.lo, TERM(square_scale), rest)};
+    const lanes rest = multiply_add_lanes(square.x, TERM(square_scale_low), product.y);
+    return (LanePair){product.x, multiply_add_lanes(square.y, TERM(square_scale), rest)};
 #else
-    return (LanePair){product.hi, product.lo + (square.lo * TERM(square_scale) + square.hi * TERM(square_scale_low))};
+    return (LanePair){product.x, product.y + (square.y * TERM(square_scale) + square.x * TERM(square_scale_low))};
 #endif
 #else
 #if GROWTH
-    const lanes scaled = off.hi * scale.hi;
+    const lanes scaled = off.x * scale.x;
     return (LanePair){scaled * (scaled * TERM(square_scale)), 0};
 #else
-    return (LanePair){off.hi * (off.hi * TERM(square_scale)), 0};
+    return (LanePair){off.x * (off.x * TERM(square_scale)), 0};
 #endif
 #endif
 }
@@ -188,16 +188,16 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
-    lanes hit = TERM(hit_peak) * exp_lanes(-exponent.hi);
+    lanes hit = TERM(hit_peak) * exp_lanes(-exponent.x);
 #if GROWTH
-    hit *= scale.hi;
-    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.hi, terms, masses, bin_at, &within);
+    hit *= scale.x;
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.x, terms, masses, bin_at, &within);
 #else
     const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale), terms, masses, bin_at, &within);
 #endif
 #if EXACT_EXPONENT
     // The second part is arbitrary where the density underflows.
-    hit = hit > 0 ? hit * (1 - exponent.lo) : hit;
+    hit = hit > 0 ? hit * (1 - exponent.y) : hit;
 #endif
     p += within ? hit : hit / mass;
 #endif
@@ -225,10 +225,10 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
-    lanes hit = (TERM(hit_peak) - exponent.hi) + (TERM(hit_peak_low) - exponent.lo);
+    lanes hit = (TERM(hit_peak) - exponent.x) + (TERM(hit_peak_low) - exponent.y);
 #if GROWTH
-    hit += log_lanes(scale.hi);
-    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.hi, terms, masses, bin_at, &within);
+    hit += log_lanes(scale.x);
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.x, terms, masses, bin_at, &within);
 #else
     const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale), terms, masses, bin_at, &within);
 #endif

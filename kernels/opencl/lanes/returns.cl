@@ -74,7 +74,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
         const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, farthest, caster);
 #if SHAPES
         const LanePair shape = nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met);
-        const lanes t = shape.hi;
+        const lanes t = shape.x;
 #else
         const lanes t = met;
 #endif
@@ -86,7 +86,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
         hit_normal_lanes(normals, window, cell, pose, dx, dy, nearer ? t : (lanes)0, &normal_x, &normal_y);
         const lanes along = dx * normal_x + dy * normal_y;
 #if SHAPES
-        const lanes cosine = t < met ? shape.lo : normal_x == normal_x ? fabs(along) : (lanes)1;
+        const lanes cosine = t < met ? shape.y : normal_x == normal_x ? fabs(along) : (lanes)1;
 #else
         const lanes cosine = normal_x == normal_x ? fabs(along) : (lanes)1;
 #endif
@@ -100,7 +100,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
     load_ray_lanes(ray, first, count, 1, &x, &y);
     const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, limit, caster);
 #if SHAPES
-    return (EchoLanes){nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met).hi, 2};
+    return (EchoLanes){nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met).x, 2};
 #else
     return (EchoLanes){met, 2};
 #endif

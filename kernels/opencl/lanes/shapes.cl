@@ -30,9 +30,9 @@ LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world
                 const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
                 met = meet_segment_lanes(dx, dy, x, y, end_x, end_y);
             }
-            const ilanes nearer = met.hi < nearest.hi;
-            nearest.hi = nearer ? met.hi : nearest.hi;
-            nearest.lo = nearer ? met.lo : nearest.lo;
+            const ilanes nearer = met.x < nearest.x;
+            nearest.x = nearer ? met.x : nearest.x;
+            nearest.y = nearer ? met.y : nearest.y;
         }
     }
     return nearest;

@@ -53,9 +53,7 @@ def find_sights(shapes, world, pose_cell, pose, sights, particles, crowd):
 
 @kernel
 def meet_shapes(shapes, world, pose_cell, pose, ray, turns, ranges, particles, rays, limit, crowd):
-    """Find the distances of the nearest shapes along the rays of particles, limit where none is nearer. ray has the
-    rays in the order of turns, see covered_rays. One work-item takes a particle.
-    """
+    """Find the distances of the nearest shapes along the rays of particles, limit where none is nearer."""
     n = work_item(wp.tid())
     if n >= particles:
         return

@@ -13,10 +13,7 @@ from .prelude import kernel, work_item
 def match_scans(
     point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far, far_turn
 ):  # fmt: skip
-    """Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
-    rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the
-    reference's points from the score.
-    """
+    """Match pairs of scans from guesses: a work-item, or with IN_TEAMS a team of them, takes a pair."""
     item = work_item(wp.tid())
     n = item // TEAM
     if n < pairs * starts:

@@ -206,10 +206,7 @@ def wait(): ...
 def cast_among_shapes(
     map_table, world, shapes, pose_cell, pose, ray, turns, ranges, particles, rays, caster, scale, crowd, each
 ):  # fmt: skip
-    """Cast rays among moving shapes: a team of work-items takes each neighbours of a particle's rays in order, see
-    covered_rays. A shape covers few rays: members share all pairs of a shape and a ray that it covers, and then the
-    rays, each of which ends at the nearest shape.
-    """
+    """Cast rays among moving shapes: a team of work-items shares a particle's rays."""
     item = work_item(wp.tid())
     member = item % TEAM
     parts = (rays + each - 1) // each

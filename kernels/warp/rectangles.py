@@ -77,9 +77,7 @@ def slope(sectors: wp.int32, sector: wp.int32):
 
 @kernel
 def free_columns(occupied, runs, band, cols, begin, end):
-    """Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
-    columns in [begin, end).
-    """
+    """Count the free cells along columns of the band, to larger or smaller rows."""
     direction, strip = wp.tid()
     first = begin + 64 * strip
     until = wp.min(first + 64, end)
@@ -152,9 +150,7 @@ def rectangles_rows(
 
 @kernel
 def free_rows(bits, runs, band, cols, words, begin, end):
-    """Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in
-    [begin, end).
-    """
+    """Count the free cells along rows, to the right and to the left."""
     row, item = wp.tid()
     start = begin + 4 * item
     if row >= band or start >= end:

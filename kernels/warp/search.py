@@ -36,9 +36,7 @@ def pool_scores(table, pooled, scores, reach):
 
 @kernel
 def fold_scores(table, out, scores, folded, period, step, beyond, unit):
-    """Write the losses of every period-th row and column of each padded table as an image, for each of (period /
-    step)^2 first cells, step apart.
-    """
+    """Write the losses of every period-th row and column of each padded table as images."""
     image, line, col = wp.tid()
     lines = padded_lines(folded)
     stride = padded_stride(folded)
@@ -61,9 +59,7 @@ def fold_scores(table, out, scores, folded, period, step, beyond, unit):
 def quarters_at(
     table: wp.array(dtype=wp.uint8), scores: ScoreTable, image: wp.int32, line: wp.int32, col: wp.int32, reach: wp.int32
 ):  # fmt: skip
-    """Return the scores of the quarters of the block that begins at a cell: upper left, upper right, lower left, lower
-    right. A quarter has reach rows and columns.
-    """
+    """Return the scores of the quarters of a block: upper left, upper right, lower left, lower right."""
     lines = padded_lines(scores)
     stride = padded_stride(scores)
     here = (image * lines + line) * stride
@@ -176,9 +172,7 @@ def pack_rows(table, packed, scores):
 
 @kernel
 def shift_scores(table, point, image, first, allowed, score, scores, items, height, width, unit):
-    """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the
-    scores; a shift that is not allowed has -1.
-    """
+    """Sum the losses of each item's points at all shifts, and write the scores; -1 where not allowed."""
     item, block, col = wp.tid()
     row = SHIFT_ROWS * block
     if col >= width or row >= height or item >= items:
@@ -221,9 +215,7 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
 
 @kernel
 def line_maxima(score, best, histogram, all, lines, length, spacing, along, turns, shift):
-    """Find the largest score of each line of shifts and its first shift, and count the lines of each scan by their
-    scores, divided by 2^shift. Lines are rows on processors, and columns on GPUs, whose neighbours read neighbours.
-    """
+    """Find the largest score of each line of shifts, and count the lines of each scan by their scores."""
     n = wp.tid()
     if n >= all:
         return
@@ -244,9 +236,7 @@ def line_maxima(score, best, histogram, all, lines, length, spacing, along, turn
 
 @wp.func
 def promising(histogram: wp.array(dtype=wp.int32), scan: wp.int32, most: wp.int32):
-    """Return the least score, divided by 2^shift, of a scan's most lines with the largest scores, and of
-    others as good.
-    """
+    """Return the least score, divided by 2^shift, of the best lines of a scan."""
     bin = int(BINS - 1)
     lines = histogram[scan * BINS + bin]
     while lines < most and bin > 0:
@@ -379,10 +369,7 @@ def divide_blocks(
     quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run, height,
     width, columns, turns, level, spacing, shift, across,
 ):  # fmt: skip
-    """Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level,
-    and collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which
-    the caller clears, may exceed room: then some are left out.
-    """
+    """Divide blocks of positions into quarters, and collect those whose scores may be high enough."""
     worker = wp.tid()
     blocks = wp.min(count[level + 1] - begin, some)
     n = run * worker

@@ -1,13 +1,4 @@
-"""Moving shapes of a world: discs, boxes and segments, in cells of its grid.
-
-A disc has 4 numbers: centre and radius, and one that is not used. A box has 8: centre, cosine and sine of its
-direction, half its length and width, radius around it, and one not used. A segment has 4: its ends. A shape whose
-numbers are NaN is met by no ray. WORLDS: world has two pairs of numbers for each particle: the first cell of its world
-among all worlds and the world's size, rows times 2^16 plus columns; the world's index and the index of the shape that
-it does not see. SHAPES: behind them, from pair crowd.begin on, it has the sights of each particle: for each of SIGHTS
-ranges of directions a bit for each shape that a ray in this range may meet, 64 shapes a pair. A ray tests only these
-shapes.
-"""
+"""Moving shapes of a world: discs, boxes and segments, in cells of its grid; shapes.cl has their layout."""
 
 import math
 
@@ -58,9 +49,7 @@ def turned(x: real, y: real):
 
 @wp.func
 def seen_between(low: vec2, high: vec2, around: wp.bool):
-    """Return the first and the last direction in which a shape is seen. From the origin, low and high are the
-    directions of its ends against the clock; a shape all around is seen in all.
-    """
+    """Return the first and the last direction in which a shape is seen, from the directions of its ends."""
     if around:
         return vec2(ZERO, NEARLY_ALL)
     first = turned(low.x, low.y) - APART
@@ -125,9 +114,7 @@ EACH = real(DIRECTIONS / 4)
 
 @wp.func
 def directions_of(one: vec4, box: vec4, i: wp.int32, crowd: Crowd, heading: vec2):
-    """Return the first and the last direction, relative to a heading (cos, sin), in which a shape is seen, by its
-    numbers relative to a pose; the last is below the first for a shape that is none.
-    """
+    """Return the first and the last direction, relative to a heading, in which a shape is seen."""
     if not (one.x - one.x == ZERO):
         return vec2(ZERO, MINUS_ONE)
     along = heading.x * one.x + heading.y * one.y
@@ -143,10 +130,7 @@ def directions_of(one: vec4, box: vec4, i: wp.int32, crowd: Crowd, heading: vec2
 def covered_rays(
     one: vec4, box: vec4, i: wp.int32, crowd: Crowd, heading: vec2, turns: wp.array(dtype=wp.int32), rays: wp.int32
 ):  # fmt: skip
-    """Return the rays that a shape covers: the place of the first among the rays in order, and their number; the first
-    ray follows the last. turns has the first place of each of DIRECTIONS ranges of directions relative to the heading,
-    the number of rays, and the rays in order.
-    """
+    """Return the rays that a shape covers: the place of the first among the rays in order, and their number."""
     seen = directions_of(one, box, i, crowd, heading)
     low = int(wp.floor(seen.x * EACH))
     high = int(wp.floor(seen.y * EACH))
@@ -159,17 +143,13 @@ def covered_rays(
 
 @wp.func
 def sight_at(crowd: Crowd, n: wp.int32, sight: wp.int32):
-    """Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of
-    directions.
-    """
+    """Return the index of the shapes that a particle may see in a range of directions."""
     return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs
 
 
 @wp.func
 def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):
-    """Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of
-    incidence; inside the disc 0 and 1.
-    """
+    """Return the distance along a ray to a disc, infinite without one, and the cosine of incidence."""
     along = dx * x + dy * y
     aside = dx * y - dy * x
     square = (radius - aside) * (radius + aside)
@@ -244,9 +224,7 @@ def nearest_shape(
     shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, cell: wp.vec2i,
     pose: vec4, ray: vec2, t: real,
 ):  # fmt: skip
-    """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the
-    distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
-    """
+    """Return the distance to the nearest shape or obstacle along a ray, and the cosine of incidence."""
     direction = ray_direction(pose, ray)
     first = cell_at(world, 2 * n + 1).x * crowd.stride
     sights = sight_at(crowd, n, int(turned(direction.x, direction.y) * QUARTER))
@@ -271,9 +249,7 @@ def shape_distance(
     shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, cell: wp.vec2i,
     point: vec2,
 ):  # fmt: skip
-    """Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a
-    shape.
-    """
+    """Return the distance from a point to the nearest shape that a particle sees."""
     nearest = real(NEVER)
     seen = cell_at(world, 2 * n + 1)
     one = seen.x * crowd.stride

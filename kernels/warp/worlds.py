@@ -1,8 +1,4 @@
-"""Many worlds in one table: their cells, obstacles and tables, poses placed in them, and collisions.
-
-Worlds of one size are made together. Their rows are interleaved: line i is row i / worlds of world i % worlds. place
-has the first cell of each in tables with a ring of two cells.
-"""
+"""Many worlds in one table: their cells, obstacles and tables, poses placed in them, and collisions."""
 
 import warp as wp
 

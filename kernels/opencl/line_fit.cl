@@ -5,20 +5,18 @@
 // Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances along the
 // line), from sums of the neighbours' coordinates relative to the point and of their products. A point without
 // neighbours gets the line perpendicular to its beam, and -1 instead of the sum.
-real4 line_through(const real4 centre, const real2 sum, const real xx, const real xy, const real yy, const int size) {
-    const real2 mean = sum / (real)size;
-    const real a = xx - size * mean.x * mean.x, b = xy - size * mean.x * mean.y, d = yy - size * mean.y * mean.y;
-    const real middle = (real)0.5 * (a - d), root = sqrt(middle * middle + b * b), length = (real)0.5 * (a + d) + root;
-    real2 along = middle >= 0 ? (real2)(middle + root, b) : (real2)(b, root - middle);
-    real size_along = sqrt(along.x * along.x + along.y * along.y);
-    const int is_line = length > 0 && size_along > 0;
-    if (!is_line) {
-        along = (real2)(-centre.y, centre.x);
-        size_along = centre.w;
-    }
-    const real2 normal = (real2)(-along.y / size_along, along.x / size_along);
-    const real offset = normal.x * (centre.x + mean.x) + normal.y * (centre.y + mean.y);
-    return (real4)(normal.x, normal.y, offset, is_line ? 1 / length : -1);
+real4 line_through(const real4 centre, const real2 sum, const real xx, const real xy, const real yy, const real size) {
+    const real mean_x = sum.x / size, mean_y = sum.y / size;
+    const real a = xx - size * mean_x * mean_x, b = xy - size * mean_x * mean_y, d = yy - size * mean_y * mean_y;
+    const real middle = (real)0.5 * (a - d), root = sqrt(middle * middle + b * b);
+    const real along_x = middle >= 0 ? middle + root : b, along_y = middle >= 0 ? b : root - middle;
+    const real size_along = sqrt(along_x * along_x + along_y * along_y);
+    // 0 without a direction.
+    const real length = size_along > 0 ? (real)0.5 * (a + d) + root : (real)0;
+    const real x = length > 0 ? along_x : -centre.y, y = length > 0 ? along_y : centre.x;
+    const real total = length > 0 ? size_along : centre.w, normal_x = -y / total, normal_y = x / total;
+    const real offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y);
+    return (real4)(normal_x, normal_y, offset, length > 0 ? 1 / length : (real)-1);
 }
 
 // Return the line through the k-th point of a scan and reach neighbours on either side, up to most within a distance of

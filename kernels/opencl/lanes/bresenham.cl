@@ -10,7 +10,7 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
 #endif
     lanes dx, dy;
     direct_lanes(pose, ray_x, ray_y, &dx, &dy);
-    const ilanes to_x = floor_ray_lanes(pose.x + limit * dx), to_y = floor_ray_lanes(pose.y + limit * dy);
+    const ilanes to_x = floor_int_lanes(pose.x + limit * dx), to_y = floor_int_lanes(pose.y + limit * dy);
     const ilanes right = to_x > 0, up = to_y > 0, far_x = right ? to_x : -to_x, far_y = up ? to_y : -to_y;
     const ilanes flat = far_x >= far_y, far = flat ? far_x : far_y;
     const ilanes longer = far == 0 ? (ilanes)1 : far, shorter = far == 0 ? (ilanes)1 : flat ? far_y : far_x;

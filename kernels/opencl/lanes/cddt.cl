@@ -25,12 +25,12 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
     const real x = (real)cell.x + pose.x, y = (real)cell.y + pose.y;
     const lanes along = c * x + s * y, across = c * y - s * x;
     const ilanes inside = (across <= FARTHEST) & (across >= -FARTHEST);
-    const ilanes line = floor_ray_lanes(inside ? across : (lanes)0) - GATHER(ilanes, bin_third, place);
+    const ilanes line = floor_int_lanes(inside ? across : (lanes)0) - GATHER(ilanes, bin_third, place);
     const ilanes valid = inside & (line >= 0) & (line < lines);
     if (!any_lane(valid)) return limit;
     lanes from_real = along > FARTHEST ? (lanes)FARTHEST : along;
     from_real = (from_real < -FARTHEST ? (lanes)-FARTHEST : from_real) * ENTRY_UNIT;
-    const ilanes floored = floor_ray_lanes(from_real);
+    const ilanes floored = floor_int_lanes(from_real);
     // Truncate.
     const ilanes from = floored - ((from_real < 0) & (to_lanes(floored) != from_real));
     const ilanes at = valid ? bin * lines + line : (ilanes)0;

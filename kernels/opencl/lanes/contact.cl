@@ -14,19 +14,13 @@ typedef struct {
     lanes x, y, cos, sin;
 } Particles;
 
-// Round down.
-ilanes floor_ilanes(const lanes a) {
-    const ilanes whole = to_ilanes(a);
-    return whole + (to_lanes(whole) > a);
-}
-
 // Return the numbers in the cells of one point of the outline. One near a cell's edge is computed again by end_point.
 ilanes look_up_lanes(global const int *table, const Particles *particle, const real2 point, const real2 point_low,
                      global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
                      const int first, const int particles, const Window window, const real guard) {
     const lanes x = particle->x + (particle->cos * point.x - particle->sin * point.y);
     const lanes y = particle->y + (particle->sin * point.x + particle->cos * point.y);
-    const ilanes to_col = floor_ilanes(x), to_row = floor_ilanes(y);
+    const ilanes to_col = floor_int_lanes(x), to_row = floor_int_lanes(y);
     const lanes left_x = x - to_lanes(to_col), left_y = y - to_lanes(to_row);
     const int stride = window.cols + 2 * FIELD_RING;
     const ilanes col = within_lanes(particle->col + to_col, stride - 1);

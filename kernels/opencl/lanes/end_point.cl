@@ -7,9 +7,7 @@ ilanes within_lanes(const ilanes i, const int last) {
 }
 
 ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_next) {
-    const lanes up = offset.x + (real)0.5;
-    ilanes nearest = to_ilanes(up);
-    nearest += to_lanes(nearest) > up;
+    const ilanes nearest = floor_int_lanes(offset.x + (real)0.5);
 #if EXACT_EXPONENT
     const LanePair past = two_sum_lanes(offset.x - to_lanes(nearest), offset.y);
     const LanePair less = {past.x < 0 ? past.x : -past.x, past.x < 0 ? past.y : -past.y};

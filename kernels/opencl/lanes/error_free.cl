@@ -6,6 +6,11 @@ typedef struct {
     lanes x, y;
 } LanePair;
 
+// A place, an offset, a direction or a line in each lane.
+typedef struct {
+    lanes x, y, z, w;
+} LaneQuad;
+
 // in lanes: two_sum ordered_sum high_half two_product pair_sum pair_product add_term
 
 // Return c - a b, where c is a b rounded or nearly so.

@@ -54,9 +54,7 @@ kernel void field_gradient(ARGUMENTS) {
         const real2 to = point[k];
         const lanes arm_x = cos * to.x - sin * to.y, arm_y = sin * to.x + cos * to.y;
         const lanes at_x = x + arm_x, at_y = y + arm_y;
-        ilanes to_col = to_ilanes(at_x), to_row = to_ilanes(at_y);
-        to_col += at_x < to_lanes(to_col);
-        to_row += at_y < to_lanes(to_row);
+        const ilanes to_col = floor_int_lanes(at_x), to_row = floor_int_lanes(at_y);
         const lanes rest_x = at_x - to_lanes(to_col), rest_y = at_y - to_lanes(to_row);
         const ilanes c = within_lanes(col + to_col, stride - 2), r = within_lanes(row + to_row, last_row);
         const ilanes index = r * stride + c;

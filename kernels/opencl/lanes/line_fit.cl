@@ -1,9 +1,10 @@
 // Lines through LANES points of a scan at once: line_fit.cl.
-// requires: lanes/math
+// requires: lanes/math lanes/error_free
 
 // Most neighbours on either side.
 #define MOST 48
-#define WHOLE_TURN 6.283185307179586f
+
+// in lanes: WHOLE_TURN line_through
 
 // Write the lines of up to LANES points of a scan from begin on; see line_at of line_fit.cl.
 void fit_block(global const real4 *point, const int count, const int begin, const int reach, const int most,
@@ -40,21 +41,11 @@ void fit_block(global const real4 *point, const int count, const int begin, cons
             last_x = next_x, last_y = next_y, last_angle = next_angle, last_range = load_lanes(0, range + at);
         }
     }
-    const lanes mean_x = sum_x / size, mean_y = sum_y / size;
-    const lanes a = xx - size * mean_x * mean_x, b = xy - size * mean_x * mean_y, d = yy - size * mean_y * mean_y;
-    const lanes middle = 0.5f * (a - d), root = sqrt(middle * middle + b * b), length = 0.5f * (a + d) + root;
-    lanes along_x = middle >= 0.0f ? middle + root : b, along_y = middle >= 0.0f ? b : root - middle;
-    lanes size_along = sqrt(along_x * along_x + along_y * along_y);
-    const ilanes is_line = length > 0.0f && size_along > 0.0f;
-    along_x = is_line ? along_x : -centre_y;
-    along_y = is_line ? along_y : centre_x;
-    size_along = is_line ? size_along : centre_range;
-    const lanes normal_x = -along_y / size_along, normal_y = along_x / size_along;
-    const lanes offset = normal_x * (centre_x + mean_x) + normal_y * (centre_y + mean_y);
-    const lanes doubt = is_line ? 1 / length : (lanes)-1;
+    const LaneQuad centre = {centre_x, centre_y, centre_angle, centre_range};
+    const LaneQuad fitted = line_through_lanes(centre, (LanePair){sum_x, sum_y}, xx, xy, yy, size);
     for (int i = 0; i < LANES && begin + i < count; ++i)
-        line[begin + i] = (real4)(((const real *)&normal_x)[i], ((const real *)&normal_y)[i],
-                                          ((const real *)&offset)[i], ((const real *)&doubt)[i]);
+        line[begin + i] = (real4)(((const real *)&fitted.x)[i], ((const real *)&fitted.y)[i],
+                                  ((const real *)&fitted.z)[i], ((const real *)&fitted.w)[i]);
 }
 
 // Write the lines of all points of a scan.

@@ -1,11 +1,6 @@
 // Offsets between places, exponents and logarithms of densities: log_terms.cl in lanes, with the functions of lanes/math.
 // requires: log_terms lanes/error_free lanes/math
 
-// A place, an offset or a direction in each lane.
-typedef struct {
-    lanes x, y, z, w;
-} LaneQuad;
-
 // Return the same numbers for all lanes.
 LaneQuad in_all_lanes(const real4 a) { return (LaneQuad){a.x, a.y, a.z, a.w}; }
 

@@ -14,8 +14,8 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
     direct_lanes(pose, ray_x, ray_y, &dx, &dy);
     ilanes going = t < limit;
     while (any_lane(going)) {
-        const ilanes col = cell.x + floor_ray_lanes(pose.x + t * dx);
-        const ilanes row = cell.y + floor_ray_lanes(pose.y + t * dy);
+        const ilanes col = cell.x + floor_int_lanes(pose.x + t * dx);
+        const ilanes row = cell.y + floor_int_lanes(pose.y + t * dy);
         const ilanes off = (col < 0) | (col >= window.cols) | (row < 0) | (row >= window.rows);
 #if OUTSIDE_OCCUPIED
         found = (going & off) ? t : found;

@@ -48,12 +48,6 @@ ilanes angle_bin_lanes(const lanes dx, const lanes dy, const int bins) {
     return nearest >= bins ? nearest - bins : nearest;
 }
 
-// Round down.
-ilanes floor_ray_lanes(const lanes a) {
-    const ilanes whole = to_ilanes(a);
-    return whole + (to_lanes(whole) > a);
-}
-
 // Convert distances in cells to metres.
 lanes range_lanes(const lanes t, const RangeScale scale) {
     const lanes range = t * scale.resolution;

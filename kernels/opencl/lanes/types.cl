@@ -99,6 +99,12 @@ real sum_lanes(const lanes a) {
 ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
 #endif
 
+// Round down.
+ilanes floor_int_lanes(const lanes a) {
+    const ilanes whole = to_ilanes(a);
+    return whole + (to_lanes(whole) > a);
+}
+
 // Read a number and the next one at each of LANES places.
 void gather_pairs(global const real *numbers, const lane_int *at, lanes *first, lanes *second) {
     const lanes low = PAIRS(numbers, at), high = PAIRS(numbers, (at + LANES / 2));

@@ -2,7 +2,7 @@
 
 A cause of weight 0 gets the weight of a hundredth of a reading, with each shape of a coarse list. If it then accounts
 for more than this, the likelihood rises with its weight (Lindsay 1983), and the search continues with this cause. See
-docs/learning.md, "Several maxima".
+docs/background/learning.md, "Several maxima".
 """
 
 from __future__ import annotations

@@ -114,9 +114,9 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
     poses, covariances = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for k in range(count):
         sampled = motion.sampled_turns(*turns_between(before[k], after[k]))
-        first, ahead, left, second = sampled.mean
+        first, ahead, _, _ = sampled.mean
         c, s = math.cos(first), math.sin(first)
-        poses[k] = c * ahead - s * left, s * ahead + c * left, first + second
+        poses[k] = sampled.after((0.0, 0.0, 0.0))
         jacobian = np.array([[-s * ahead, c, -s, 0.0], [c * ahead, s, c, 0.0], [1.0, 0.0, 0.0, 1.0]])
         covariances[k] = jacobian * np.square(sampled.deviation) @ jacobian.T
     covariances += np.diag([_LEAST[0] ** 2, _LEAST[0] ** 2, _LEAST[1] ** 2])

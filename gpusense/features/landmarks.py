@@ -133,11 +133,7 @@ def _free_places(grid: OccupancyGrid) -> Floats:
         if len(rows) <= _MOST_SCANS:
             break
         step = math.ceil(step * math.sqrt(len(rows) / _MOST_SCANS) * 1.02)
-    x = (first + step * cols + 0.5) * grid.resolution
-    y = (first + step * rows + 0.5) * grid.resolution
-    ox, oy, yaw = grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.column_stack([ox + c * x - s * y, oy + s * x + c * y, np.zeros(len(x))])
+    return np.column_stack([grid.cell_centers(first + step * rows, first + step * cols), np.zeros(len(rows))])
 
 
 # Features form one landmark within this many deviations plus this distance [m], lines plus this direction [rad].

@@ -77,10 +77,7 @@ def free_pool(models: Sequence[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
         half = (box[1] - box[0]) / 2
         return np.array([[*(box[0] + half), 0.0]]), (float(half[0]), float(half[1]), math.pi)
     rows, columns = np.nonzero(grid.free)
-    x0, y0, yaw = grid.origin
-    along, up = (columns + 0.5) * grid.resolution, (rows + 0.5) * grid.resolution
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    centres = np.column_stack([x0 + cosine * along - sine * up, y0 + sine * along + cosine * up, np.zeros(len(rows))])
+    centres = np.column_stack([grid.cell_centers(rows, columns), np.zeros(len(rows))])
     if box is not None:
         centres = centres[((centres[:, :2] >= box[0]) & (centres[:, :2] <= box[1])).all(axis=1)]
     if not len(centres):

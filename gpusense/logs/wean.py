@@ -22,6 +22,7 @@ import numpy as np
 
 from gpusense._util.lines import numbers_in, until_cut
 from gpusense._util.typing import Floats
+from gpusense.localization.pose_algebra import pose_difference
 from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 
@@ -81,7 +82,5 @@ def _numbers(where: str, fields: list[bytes]) -> Floats:
 
 def _mount(robot: Pose, laser: Pose) -> Pose:
     """Return the laser's pose on the robot, rounded."""
-    dx, dy = laser[0] - robot[0], laser[1] - robot[1]
-    c, s = math.cos(robot[2]), math.sin(robot[2])
-    turn = math.remainder(laser[2] - robot[2], math.tau)
-    return round(c * dx + s * dy, 3) + 0.0, round(c * dy - s * dx, 3) + 0.0, round(turn, 3) + 0.0
+    x, y, turn = (pose_difference(robot, laser).round(3) + 0.0).tolist()
+    return x, y, turn

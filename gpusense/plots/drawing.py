@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.files import write_whole
+from gpusense.localization.pose_algebra import compose_poses
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
@@ -117,10 +118,7 @@ def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, 
 
     x, y, theta = checks.array("pose", pose, (3,)).tolist()
     z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
-    ahead, aside, _ = scanner.mount
-    c, s = math.cos(theta), math.sin(theta)
-    start = np.array([x + c * ahead - s * aside, y + s * ahead + c * aside])
-    ends = end_points(z, scanner, (x, y, theta))
+    start, ends = compose_poses((x, y, theta), scanner.mount)[:2], end_points(z, scanner, (x, y, theta))
     beams = np.stack([np.broadcast_to(start, ends.shape), ends], axis=1)
     ax.add_collection(LineCollection(list(beams), colors=BEAM, linewidths=0.6, alpha=0.35, zorder=4), autolim=False)
     ax.scatter(ends[:, 0], ends[:, 1], s=9, c=BEAM, linewidths=0, zorder=5)

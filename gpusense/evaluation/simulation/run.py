@@ -295,9 +295,7 @@ def draw_odometry(
         ahead = ahead / (1 + stretch)
         drifted = drift * ahead / 2
         first, second = (first - drifted) / (1 + gain), (second - drifted) / (1 + gain)
-        c, s = math.cos(first), math.sin(first)
-        moved = (c * ahead - s * left, s * ahead + c * left, first + second)
-        odometry[t] = compose_poses(odometry[t - 1], moved)
+        odometry[t] = step._replace(mean=(first, ahead, left, second)).after(odometry[t - 1].tolist())
     return odometry
 
 

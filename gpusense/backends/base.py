@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -206,6 +206,10 @@ class Backend(ABC):
     def wrap_external(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
         """Return a buffer as an array of the backend's library."""
         raise TypeError(f"{self.info.selection} does not wrap buffers")
+
+    def ahead(self, array: object) -> Hashable:
+        """Return the key of results of an array's library that may be allocated before their call; None if none may."""
+        return None
 
     def empty_like(self, array: object, shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, Buffer] | None:
         """Return a new array of the library of a device array, with its memory as a buffer; None if it makes none."""

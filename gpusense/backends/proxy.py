@@ -48,5 +48,5 @@ class Proxy(Backend):
     largest_group = _forwarded("largest_group")
     begin_batch, submit, end_batch = map(_forwarded, ("begin_batch", "submit", "end_batch"))
     address, reads, adopt, view, wrap_external = map(_forwarded, ("address", "reads", "adopt", "view", "wrap_external"))
-    empty_like = _forwarded("empty_like")
+    ahead, empty_like = map(_forwarded, ("ahead", "empty_like"))
     check_process = _forwarded("check_process")

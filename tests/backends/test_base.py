@@ -102,7 +102,7 @@ def test_abilities_that_a_backend_lacks():
     device.end_batch()
     device.check_process()
     assert (device.in_batch, device.replays, device.reads(array), device.alignment) == (False, False, False, 1)
-    assert device.address(array) == id(array) and device.calls == []
+    assert device.ahead(array) is None and device.address(array) == id(array) and device.calls == []
     assert device.empty_external(2, INT).shape == (2,) and device.calls == [("empty", 2, False)]
     with pytest.raises(TypeError, match="poses: must be in host memory for numpy, got an array on a device"):
         device.adopt(array, "poses")

@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import numpy as np
@@ -172,6 +172,9 @@ class OpenCLBackend(ProcessBound, Backend):
         self._check_size(size)
         with driver_errors():
             return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
+
+    def ahead(self, array: object) -> Hashable:
+        return (type(array),)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
         if not size:

@@ -99,29 +99,22 @@ class Results(FreedMemory):
 
     def _memory(self, size: int) -> wp.array:
         """Return memory that no array uses."""
-        memory = self.take(size)
+        # The legacy stream waits for blocking streams, on which others may still use the memory: Warp frees it there.
+        captures = self._device.is_cuda and getattr(self._device, "captures", None)
+        memory = None if captures else self.take(size)
         if memory is None:
             return self._empty(size, np.dtype(np.uint8))
         if self._device.is_cuda:
-            self._device.stream.wait_event(memory._gpusense_freed)
+            _wait_for(self._device, self._device.null_stream)
         return memory
 
     def take_back(self, block: wp.array) -> None:
-        """Keep the memory of a freed array, with an event after all earlier work on it.
-
-        The legacy stream waits for blocking streams, on which others may still use the memory: Warp frees it there.
-        """
+        """Keep the memory of a freed array."""
         # The interpreter may be ending.
         with contextlib.suppress(AttributeError, TypeError):
-            if self._device.is_cuda:
-                if getattr(self._device, "captures", None):
-                    # Warp frees memory once a capture has ended.
-                    return
-                with self._device.context_guard:
-                    if not hasattr(block, "_gpusense_freed"):
-                        block._gpusense_freed = wp.Event(self._device)
-                    self._device.null_stream.record_event(block._gpusense_freed)
-            super().take_back(block)
+            # Warp frees memory once a capture has ended.
+            if not (self._device.is_cuda and getattr(self._device, "captures", None)):
+                super().take_back(block)
 
 
 def _view(array: Any, device: wp.Device, name: str) -> wp.array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import threading
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -144,6 +145,10 @@ class WarpBackend(ProcessBound, Backend):
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
         """See Backend.adopt; every array on the device can be used in place."""
         return adopted(array, self._device, name)
+
+    def ahead(self, array: object) -> Hashable:
+        """See Backend.ahead; the memory serves the current stream, and other libraries have their own ones."""
+        return (wp.array, self._device.stream if self._device.is_cuda else None) if type(array) is wp.array else None
 
     def empty_like(self, array: Any, shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, wp.array] | None:
         return self._results_there.empty_like(array, shape, dtype)

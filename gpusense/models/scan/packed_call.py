@@ -101,10 +101,10 @@ class PackedCall:
             out = backend.view(results.parts[0], (count,), real)
         self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, self._status, limits)
 
-    def score(self, poses: Any, ranges: Any, out: Any) -> Any:
+    def score(self, poses: Any, ranges: Any, out: Any, meanwhile: Callable[[], None] | None = None) -> Any:
         """Score poses; return ``out``, or a new array of the host without it; None if a pose is not finite.
 
-        No array of the host is written where a pose is not finite.
+        No array of the host is written where a pose is not finite. ``meanwhile``: called while the device works.
         """
         exchange = self._exchange
         exchange.begin()
@@ -117,6 +117,8 @@ class PackedCall:
         exchange.start(recording)
         if self._result is not None:
             self._backend.copy(self._result[0], out, self._result[1])
+        if meanwhile is not None:
+            meanwhile()
         results = exchange.finish()
         status = results[self._flag].view(_INT)
         if status[0]:
@@ -162,6 +164,8 @@ class PackedCallCache:
         self._places = RepeatCache[PackedCall](_MOST_PLACES, _BEFORE, _PATIENCE)
         # The latest addresses of poses, ranges and results.
         self._known: tuple[list[int], ...] = ([], [], [])
+        # The memory of the next result on the device, with its key, made while the device worked.
+        self._ahead: tuple[Any, Result] | None = None
         # A private lock, since the scoring thread holds the model's lock.
         self._lock = threading.Lock()
 
@@ -197,25 +201,40 @@ class PackedCallCache:
         try:
             result, target = None, None
             if not in_host or out is not None:
-                result = Result(poses, out, (count,), pipeline.real, pipeline.backend, on_device=not in_host)
+                result = self._result(poses, out, count, on_device=not in_host)
                 target = result.flat
             # Libraries of CUDA reuse the memory of earlier results.
             in_place = not in_host and (out is not None or pipeline.backend.info.graphs)
             call = self._call((at, readings), target, in_place=in_place)
             if call is None:
                 return None
-            scored = call.score(at, readings, target)
+            ahead = out is None and not in_host and pipeline.backend.ahead(poses) is not None
+            meanwhile = functools.partial(self._allocate, poses, count) if ahead else None
+            scored = call.score(at, readings, target, meanwhile)
             if scored is None:
                 return None
         except MemoryError:
             # The buffers of both kinds of calls may not fit the device at once.
             self._sizes.clear()
             self._places.clear()
+            self._ahead = None
             return None
         self.last = functools.partial(call.shown, poses, ranges)
         if rules.first_scans.left:
             rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
         return scored if result is None else result.user_array()
+
+    def _result(self, poses: Any, out: Any, count: int, *, on_device: bool) -> Result:
+        """Return the memory of a result: ``out``, or memory that the last call has allocated, or new memory."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and out is None and ahead[0] == (count, self._pipeline.backend.ahead(poses)):
+            return ahead[1]
+        return Result(poses, out, (count,), self._pipeline.real, self._pipeline.backend, on_device=on_device)
+
+    def _allocate(self, poses: Any, count: int) -> None:
+        """Allocate the next result on the device."""
+        key = count, self._pipeline.backend.ahead(poses)
+        self._ahead = key, self._result(poses, None, count, on_device=True)
 
     def _operand(self, array: Any, name: str) -> np.ndarray | Adopted | None:
         """Return an array of the host or of the device; None if the ordinary call must read or refuse it."""

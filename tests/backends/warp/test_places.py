@@ -206,28 +206,33 @@ def test_memory_of_freed_results_is_used_again(needs):
     assert (last.numpy() == 3.0).all()
 
 
-def test_freed_memory_waits_for_every_blocking_stream(needs, monkeypatch):
-    """The legacy stream notes when the array was freed; a capture forbids that."""
+def test_freed_memory_waits_for_every_blocking_stream(needs):
+    """The current stream follows the legacy stream when memory is taken; a capture forbids that."""
     import warp as wp
 
     from gpusense.backends.warp.arrays import Results
 
     needs("warp")
     events: list[Any] = []
-    null = types.SimpleNamespace(record_event=lambda event: events.append(("record", event)))
-    current = types.SimpleNamespace(wait_event=lambda event: events.append(("wait", event)))
+    null, current = object(), types.SimpleNamespace(wait_stream=events.append)
     device = types.SimpleNamespace(
         is_cuda=True, captures={}, null_stream=null, stream=current, context_guard=contextlib.nullcontext()
     )
-    monkeypatch.setattr(wp, "Event", lambda device: object())
     results, block = Results(device, get_backend("warp:cpu").empty), wp.zeros(32, dtype=wp.uint8, device="cpu")
     for _ in range(2):
         results.take_back(block)
         assert results._memory(32) is block
-    assert events == [("record", events[0][1]), ("wait", events[0][1])] * 2
+    assert events == [null, null]
+    results.take_back(block)
+    device.captures[1] = "a capture"
+    assert results._memory(32) is not block
+    results.take_back(block)
+    device.captures.clear()
+    assert results._memory(32) is block and len(events) == 3
     device.captures[1] = "a capture"
     results.take_back(block)
-    assert results._memory(32) is not block and len(events) == 4
+    device.captures.clear()
+    assert results._memory(32) is not block and len(events) == 3
 
 
 def test_an_array_of_warp(needs):
@@ -243,3 +248,19 @@ def test_an_array_of_warp(needs):
     strided = adopted(array[:, :2], host, "poses")
     assert strided.strides == (24, 8) and not strided.contiguous
     assert (strided.to_host() == NUMBERS[:, :2]).all()
+
+
+def test_results_are_allocated_ahead_for_the_current_stream_alone(needs):
+    import warp as wp
+    from support.array_libraries import to_device
+
+    from gpusense.backends.warp.backend import WarpBackend
+
+    needs("warp")
+    array, device = to_device(NUMBERS), types.SimpleNamespace(is_cuda=True, stream=object())
+    backend: Any = types.SimpleNamespace(_device=device)
+    before = WarpBackend.ahead(backend, array)
+    assert before == WarpBackend.ahead(backend, array) == (wp.array, device.stream)
+    device.stream = object()
+    assert WarpBackend.ahead(backend, array) != before
+    assert WarpBackend.ahead(backend, as_torch(NUMBERS)) is None, "PyTorch has streams of its own"

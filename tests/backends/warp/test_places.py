@@ -250,17 +250,16 @@ def test_an_array_of_warp(needs):
     assert (strided.to_host() == NUMBERS[:, :2]).all()
 
 
-def test_results_are_allocated_ahead_for_the_current_stream_alone(needs):
+def test_results_are_allocated_ahead_for_the_current_stream_alone(device):
     import warp as wp
     from support.array_libraries import to_device
 
     from gpusense.backends.warp.backend import WarpBackend
 
-    needs("warp")
-    array, device = to_device(NUMBERS), types.SimpleNamespace(is_cuda=True, stream=object())
-    backend: Any = types.SimpleNamespace(_device=device)
+    array, there = to_device(NUMBERS), types.SimpleNamespace(is_cuda=True, stream=object())
+    backend: Any = types.SimpleNamespace(_device=there)
     before = WarpBackend.ahead(backend, array)
-    assert before == WarpBackend.ahead(backend, array) == (wp.array, device.stream)
-    device.stream = object()
+    assert before == WarpBackend.ahead(backend, array) == (wp.array, there.stream)
+    there.stream = object()
     assert WarpBackend.ahead(backend, array) != before
     assert WarpBackend.ahead(backend, as_torch(NUMBERS)) is None, "PyTorch has streams of its own"

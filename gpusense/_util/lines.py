@@ -114,25 +114,44 @@ def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
     return _LINES + size, most_bytes(size)
 
 
-def until_cut(file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]]) -> Iterator[T]:
+def until_cut(
+    file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]], *, skip: bool = False
+) -> Iterator[T]:
     """Yield the records that ``read`` yields from the numbered lines of a file; it raises ValueError at a bad line.
 
     A last line without a line break that breaks the format was truncated by a killed recorder or an interrupted copy.
-    It is skipped with a warning, unless it is the first record.
+    It is skipped with a warning, unless it is the first record. ``skip``: Whether to skip other bad lines too, if they
+    are fewer than the records, with one warning; ``read`` is called again for the lines after each of them.
     """
-    last, any_record = (0, b"\n"), False
+    last, ended, records, bad = (0, b"\n"), False, 0, 0
+    first: ValueError | None = None
+    numbered = numbered_lines(file)
 
     def lines() -> Iterator[tuple[int, bytes]]:
-        nonlocal last
-        for each in numbered_lines(file):
+        nonlocal last, ended
+        for each in numbered:
             last = each
             yield each
+        ended = True
 
-    try:
-        for record in read(lines()):
-            any_record = True
-            yield record
-    except ValueError:
-        if last[1].endswith(b"\n") or not any_record:
-            raise
-        warnings.warn(f"{file}:{last[0]}: the file ends in the middle of this line, which is left out", stacklevel=2)
+    while True:
+        try:
+            for record in read(lines()):
+                records += 1
+                yield record
+            break
+        except ValueError as error:
+            where = f"{file}:{last[0]}"
+            if ended and bad:
+                break
+            if records and not last[1].endswith(b"\n"):
+                warnings.warn(f"{where}: the file ends in the middle of this line, which is left out", stacklevel=2)
+                break
+            if not skip or not str(error).startswith(f"{where}:"):
+                raise
+            first, bad = first or error, bad + 1
+    if first is not None:
+        if bad >= records:
+            raise first
+        reason = str(first).removeprefix(f"{file}:")
+        warnings.warn(f"{file}: skipped lines: {bad}; the first is line {reason}", stacklevel=2)

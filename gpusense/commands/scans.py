@@ -101,14 +101,12 @@ def read_posed_steps(args: argparse.Namespace) -> list[Step]:
     """Read the chosen scans of ``--log``, with the poses of ``--reference`` if set; scans without one are skipped."""
     steps = read_chosen_steps(args, odometry=False)
     if args.reference is None:
-        log_steps.check_scanners(steps, args.log)
-        return steps
+        return log_steps.of_one_scanner(steps, args.log)
     poses = trajectory_files.poses_at([step.scan.time for step in steps], *trajectory_files.read_tum(args.reference))
     known = [replace(step, scan=replace(step.scan, pose=pose)) for step, pose in zip(steps, poses, strict=True) if pose]
     if len(known) < len(steps):
         sys.stderr.write(f"gpusense: --reference: has poses of {len(known)} of {len(steps)} chosen scans\n")
-    log_steps.check_scanners(known, args.log)
-    return known
+    return log_steps.of_one_scanner(known, args.log)
 
 
 def scanners_of(steps: list[Step]) -> dict[str, Any]:

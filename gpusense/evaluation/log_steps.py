@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Unpack
 
 import numpy as np
 
+from gpusense._util.notices import warn_user
 from gpusense._util.typing import Floats
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at, read_tum
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
@@ -58,7 +60,7 @@ def read_steps(
     corrected pose of the previous scan. The odometry is then chained from these readings.
 
     ``limit``: Largest number of scans; None for all. Nothing is read after the last one. ``odometry``: Whether to read
-    wheel readings between the scans, and to check that all scans of a laser have one scanner.
+    wheel readings between the scans, and to keep the scans of one scanner of each laser only.
     """
     chained, last, between = np.zeros(3), None, None
     steps: list[Step] = []
@@ -81,21 +83,34 @@ def read_steps(
         counts[sensor] += 1
     if not steps:
         raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
-    if odometry:
-        check_scanners(steps, path)
-    return steps
+    return of_one_scanner(steps, path) if odometry else steps
 
 
-def check_scanners(steps: Sequence[Step], path: str | os.PathLike[str]) -> None:
-    """Check that all scans of each laser of a log have one scanner."""
-    scanners: dict[int, Scanner] = {}
+def of_one_scanner(steps: Sequence[Step], path: str | os.PathLike[str]) -> list[Step]:
+    """Return the steps with the scanner of most scans of their laser, and warn of the others; they must be fewer.
+
+    Scans with another mount are an error.
+    """
+    found: dict[int, Counter[Scanner]] = {}
     for step in steps:
-        check_scanner(step.scan, scanners.setdefault(step.sensor, step.scan.scanner), f"scan {step.index} of {path}")
+        found.setdefault(step.sensor, Counter())[step.scan.scanner] += 1
+    usual = {sensor: scanners.most_common(1)[0][0] for sensor, scanners in found.items()}
+    kept = [step for step in steps if step.scan.scanner == usual[step.sensor]]
+    few = all(2 * scanners[usual[sensor]] > scanners.total() for sensor, scanners in found.items())
+    for step in steps:
+        scanner = usual[step.sensor] if few else next(iter(found[step.sensor]))
+        if not few or step.scan.scanner.mount != scanner.mount:
+            check_scanner(step.scan, scanner, f"scan {step.index} of {path}")
+    if len(kept) < len(steps):
+        warn_user(
+            f"{path}: scans with other beams or range limits are left out: {len(steps) - len(kept)} of {len(steps)}"
+        )
+    return kept
 
 
 def with_poses(steps: Sequence[Step], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
     """Return the numbered scans of steps of a log, which must have poses, and one scanner for each laser."""
-    check_scanners(steps, path)
+    steps = of_one_scanner(steps, path)
     for step in steps:
         if step.scan.pose is None:
             raise ValueError(

@@ -32,6 +32,7 @@ MCAP, ROS1, SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
 ZSTD = b"\x28\xb5\x2f\xfd"
 LARGEST = 1 << 29
 """Largest chunk or message [bytes]."""
+_LAST_ROW = 1 << 62
 
 
 class Topic(NamedTuple):
@@ -50,16 +51,30 @@ class Raw(NamedTuple):
 
 
 class Storage:
-    """A file of a bag: ``counts`` of messages by topic (0 if unknown), ``start`` [ns], and whether it is cut off."""
+    """A file of a bag: ``counts`` of messages by topic (0 if unknown), ``start`` [ns], and whether it is cut off.
+
+    ``ros1``: whether messages are encoded as in ROS 1; ``broken``: the reasons for the chunks that cannot be read.
+    """
+
+    ros1 = False
 
     def __init__(self, file: Path) -> None:
         self.file = file
         self.counts: Counter[Topic] = Counter()
+        self.broken: dict[int, Exception] = {}
         self.start, self.cut = 0, False
 
     def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
         """Yield the messages of some topics by time, up to the cut of a file that is cut off."""
-        raise NotImplementedError
+        yield from ()
+
+
+def _topic(kind: str, name: str, encoding: str) -> Topic:
+    """Return a topic; the type of one with an unknown encoding ends with it, so that no reader takes the topic."""
+    if encoding == "ros1":
+        package, _, last = kind.rpartition("/")
+        kind = f"{package.split('/')[0]}/msg/{last}"
+    return Topic(kind if encoding in ("cdr", "ros1") else f"{kind} as {encoding[:20]}", name)
 
 
 def zstd() -> Any:
@@ -91,14 +106,14 @@ class Sqlite(Storage):
             os.truncate(self.file, size)
         with self._open() as database:
             rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-            self._topics = {number: Topic(str(kind), str(name)) for number, name, kind, _ in rows}
-            other = next((each for each in rows if each[3] != "cdr"), None)
-            if other is not None:
-                raise ValueError(f"{other[1]}: must be encoded as cdr, got {other[3]!r}")
+            self._topics = {number: _topic(str(kind), str(name), str(code)) for number, name, kind, code in rows}
             numbers: dict[int, int] = {}
-            if not self.cut:
-                numbers = dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+            try:
                 self.start = database.execute("SELECT min(timestamp) FROM messages").fetchone()[0] or 0
+                numbers = dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+            except importlib.import_module("sqlite3").DatabaseError as error:
+                if not self.cut:
+                    self.broken[0] = error
         for number, topic in self._topics.items():
             self.counts[topic] += numbers.get(number, 0)
 
@@ -114,27 +129,32 @@ class Sqlite(Storage):
     def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
         chosen = {number: topic for number, topic in self._topics.items() if wanted(topic)}
         with self._open() as database:
-            if self.cut:
-                yield from self._up_to_the_cut(database, chosen)
+            if self.cut or self.broken:
+                yield from self._sound_rows(database, chosen)
                 return
             marks = ", ".join("?" * len(chosen))
             query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp"
             for time, number, data in database.execute(query, list(chosen)):
                 yield Raw(time, chosen[number], data)
 
-    def _up_to_the_cut(self, database: Any, chosen: dict[int, Topic]) -> Iterator[Raw]:
-        """Yield messages by row, up to the first incomplete one."""
-        with contextlib.suppress(importlib.import_module("sqlite3").DatabaseError):
-            for time, number, data in database.execute("SELECT timestamp, topic_id, data FROM messages ORDER BY id"):
-                if number not in self._topics:
-                    return
-                if number in chosen:
-                    yield Raw(time, chosen[number], data)
+    def _sound_rows(self, database: Any, chosen: dict[int, Topic]) -> Iterator[Raw]:
+        """Yield messages by row; broken ones are passed in growing steps."""
+        last, step = -1, 1
+        while last < _LAST_ROW:
+            query = "SELECT id, timestamp, topic_id, data FROM messages WHERE id > ? ORDER BY id"
+            with contextlib.suppress(importlib.import_module("sqlite3").DatabaseError):
+                for row, time, number, data in database.execute(query, (last,)):
+                    if number not in self._topics:
+                        return
+                    last, step = row, 1
+                    if number in chosen:
+                        yield Raw(time, chosen[number], data)
+                return
+            last, step = last + step, 2 * step
 
 
-# Kinds of records in MCAP: header, footer, schema, channel, message, chunk, index of messages, end of the data.
-_M_HEADER, _M_FOOTER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK, _M_INDEX = 1, 2, 3, 4, 5, 6, 7
-_M_LAST = 15
+# Kinds of records in MCAP: footer, schema, channel, message, chunk, index of messages.
+_M_FOOTER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK, _M_INDEX = 2, 3, 4, 5, 6, 7
 # Kinds of records in ROS 1: message, header of the bag, index of messages, chunk, connection.
 _R_MESSAGE, _R_BAG, _R_INDEX, _R_CHUNK, _R_CONNECTION = 2, 3, 4, 5, 7
 
@@ -188,8 +208,14 @@ class _Chunked(Storage):
         """Yield topic, time [ns] and bytes of the messages in a chunk, and record the topics that it describes."""
         with self.file.open("rb") as stream:
             stream.seek(chunk.place)
-            data = _decompressed(stream.read(chunk.length), chunk)
-        yield from self._parse(data)
+            data = stream.read(chunk.length)
+        try:
+            yield from self._parse(_decompressed(data, chunk))
+        except ImportError:
+            raise
+        except Exception as error:
+            if chunk.whole:
+                self.broken[chunk.place] = error
 
     def _walk(self, stream: BinaryIO, size: int) -> None:
         raise NotImplementedError
@@ -201,20 +227,19 @@ class _Chunked(Storage):
 
 def _decompressed(data: bytes, chunk: _Chunk) -> bytes:
     """Decompress a chunk, or as much as possible of a chunk that is cut off."""
-    if chunk.compression in (b"", b"none"):
-        return data
     makers: dict[bytes, Callable[[], Any]] = {
         b"bz2": bz2.BZ2Decompressor,
         b"lz4": lambda: importlib.import_module("lz4.frame").LZ4FrameDecompressor(),
         b"zstd": lambda: zstd().ZstdDecompressor(),
     }
-    if chunk.compression not in makers:
+    plain = chunk.compression in (b"", b"none")
+    if not plain and chunk.compression not in makers:
         raise ValueError(f"must have chunks of a known compression, got {chunk.compression[:20]!r}")
     if chunk.size > LARGEST:
         raise ValueError(f"chunk: must hold at most {LARGEST} bytes, got {chunk.size}")
     if not chunk.whole:
-        return bytes(makers[chunk.compression]().decompress(data, chunk.size))
-    found = inflated(makers[chunk.compression], data, chunk.size)
+        return data if plain else bytes(makers[chunk.compression]().decompress(data, chunk.size))
+    found = data if plain else inflated(makers[chunk.compression], data, chunk.size)
     if len(found) != chunk.size or (chunk.checksum and zlib.crc32(found) != chunk.checksum):
         raise ValueError(f"chunk: must hold the {chunk.size} bytes that its header states, got other ones")
     return found
@@ -231,8 +256,8 @@ class Mcap(_Chunked):
             place = stream.tell()
             whole = length <= size - place
             if kind == _M_FOOTER:
-                return
-            if not 0 < kind <= _M_LAST or (not whole and kind != _M_CHUNK):
+                break
+            if not kind or (not whole and kind != _M_CHUNK):
                 break
             if kind == _M_CHUNK:
                 self._add_chunk(stream, length, whole)
@@ -240,10 +265,10 @@ class Mcap(_Chunked):
                 number, time = struct.unpack("<H4xQ", stream.read(14))
                 self._numbers[number] += 1
                 self._chunks.append(_Chunk(time, place - 9, length + 9, b"", length + 9, 0, True))
-            elif kind in (_M_HEADER, _M_SCHEMA, _M_CHANNEL, _M_INDEX):
+            elif kind in (_M_SCHEMA, _M_CHANNEL, _M_INDEX):
                 self._take(kind, stream.read(length))
             stream.seek(place + length)
-        self.cut = True
+        self.cut = len(head) < 9 or kind != _M_FOOTER or place + length + len(MCAP) != size
 
     def _add_chunk(self, stream: BinaryIO, length: int, whole: bool) -> None:
         place = stream.tell()
@@ -259,17 +284,14 @@ class Mcap(_Chunked):
 
     def _take(self, kind: int, data: bytes) -> None:
         """Record the description of a topic, or the number of messages of a topic in a chunk."""
-        if kind == _M_HEADER and data[4:8] != b"ros2":
-            raise ValueError(f"must have the profile ros2, got {data[4:24]!r}")
         if kind == _M_SCHEMA:
             self._kinds[struct.unpack_from("<H", data)[0]] = _text(data, 2)[0]
         elif kind == _M_CHANNEL:
             number, schema = struct.unpack_from("<HH", data)
             name, end = _text(data, 4)
             encoding, _ = _text(data, end)
-            if encoding != "cdr":
-                raise ValueError(f"{name}: must be encoded as cdr, got {encoding[:20]!r}")
-            self._topics[number] = Topic(self._kinds.get(schema, ""), name)
+            self.ros1 = self.ros1 or encoding == "ros1"
+            self._topics[number] = _topic(self._kinds.get(schema, ""), name, encoding)
         elif kind == _M_INDEX:
             number, length = struct.unpack_from("<HI", data)
             self._numbers[number] += length // 16
@@ -280,7 +302,7 @@ class Mcap(_Chunked):
             kind, length = struct.unpack_from("<BQ", data, at)
             at += 9
             if length > len(data) - at:
-                return
+                raise ValueError("chunk: must hold whole records, got a longer one")
             if kind == _M_MESSAGE:
                 number, time = struct.unpack_from("<H4xQ", data, at)
                 yield number, time, data[at + 22 : at + length]
@@ -297,6 +319,8 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
 
 class Ros1(_Chunked):
     """A bag of ROS 1."""
+
+    ros1 = True
 
     def _walk(self, stream: BinaryIO, size: int) -> None:
         stream.seek(len(ROS1))
@@ -329,13 +353,13 @@ class Ros1(_Chunked):
 
     def _take(self, fields: dict[bytes, bytes], data: bytes) -> None:
         """Record a connection."""
-        package, _, name = _fields(data)[b"type"].decode().rpartition("/")
+        kind = _fields(data)[b"type"].decode()
         topic = fields[b"topic"].decode()
         topic = "/" * topic.startswith("/") + "/".join(part for part in topic.split("/") if part)
-        self._topics[struct.unpack("<I", fields[b"conn"])[0]] = Topic(f"{package.split('/')[0]}/msg/{name}", topic)
+        self._topics[struct.unpack("<I", fields[b"conn"])[0]] = _topic(kind, topic, "ros1")
 
     def _parse(self, data: bytes) -> Iterator[tuple[int, int, bytes]]:
-        stream = io.BytesIO(data)
+        stream, whole = io.BytesIO(data), True
         for kind, fields, length, whole in _ros1_records(stream, len(data)):
             content = stream.read(length)
             if whole and kind == _R_CONNECTION:
@@ -343,6 +367,8 @@ class Ros1(_Chunked):
             elif whole and kind == _R_MESSAGE:
                 seconds, rest = struct.unpack("<II", fields[b"time"])
                 yield struct.unpack("<I", fields[b"conn"])[0], seconds * 10**9 + rest, content
+        if not whole or stream.tell() < len(data):
+            raise ValueError("chunk: must hold whole records, got another one")
 
 
 def _ros1_records(stream: BinaryIO, end: int) -> Iterator[tuple[int, dict[bytes, bytes], int, bool]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,9 +14,9 @@ import numpy as np
 from gpusense._util.notices import warn_user
 from gpusense._util.typing import Floats
 from gpusense.logs.bag_beams import Geometry, geometry_of
-from gpusense.logs.bags import ECHOES, ODOMETRY, SCAN, TRANSFORMS, Message, messages, topics_of
+from gpusense.logs.bags import ECHOES, ODOMETRY, SCAN, TRANSFORMS, Message, Skipped, messages, topics_of
 from gpusense.logs.records import Pose, planar
-from gpusense.logs.transform_buffer import TransformBuffer
+from gpusense.logs.transform_buffer import BACK, TransformBuffer
 from gpusense.world.messages import LEVEL, planar_part, stamp_of, tilt_of
 from gpusense.world.messages import field as field_of
 
@@ -150,13 +151,20 @@ def base_order(frame: str) -> tuple[int, str]:
 
 
 def check_track(place: str, track: Track, scans_at: Times) -> None:
-    """Warn of odometry that is not level, or does not overlap with the scans in time."""
+    """Warn of odometry that is not level, of stamps that go back, and of scans and odometry without common times."""
     if not track.poses:
         return
     warn_of_tilt(place, f"odometry ({track.source})", track)
     for one, other in ((scans_at, track.times), (track.times, scans_at)):
         # A simulation that begins at 0 may have a single message.
         one.from_zero = len(one.stamps) == 1 and other.stamped and min(other.stamps) <= _APART
+    for name, times in (("scans", scans_at), ("odometry", track.times)):
+        back = [one - two for one, two in itertools.pairwise(times.stamps) if times.stamped and one - two > BACK]
+        if back:
+            warn_user(
+                f"{place}: the stamps of {name} go back {len(back)} times, by up to {max(back):.9g} s: scans with such "
+                "stamps may have another time's pose in odometry"
+            )
     scans, poses = list(scans_at), list(track.times)
     if min(scans) > max(poses) + _APART or max(scans) < min(poses) - _APART:
         warn_user(
@@ -188,29 +196,6 @@ class Bag:
     transforms: TransformBuffer = field(default_factory=TransformBuffer)
 
 
-class Skipped:
-    """Skipped messages and transforms with invalid numbers."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._reason = ""
-
-    def add(self, message: Message, error: Exception) -> None:
-        """Count a message."""
-        self._reason = self._reason or f"{message.where.rpartition(': ')[2]}: {error}"
-        self._counts[message.topic] += 1
-
-    def warn(self, path: Path) -> None:
-        """Warn with the counts by topic."""
-        if total := self._counts.total():
-            each = ", ".join(f"{number} on {topic}" for topic, number in sorted(self._counts.items()))
-            warn_user(f"{path}: skipped messages: {total} ({each}); the first is {self._reason}")
-
-    def reason(self, topic: str) -> str:
-        """Return the count of a topic and the first error; empty for a topic without skipped messages."""
-        return f" but {self._counts[topic]} that are skipped ({self._reason})" if self._counts[topic] else ""
-
-
 def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str | None) -> Bag:
     """Read everything except readings, with warnings; arguments as for :func:`gpusense.read_log`."""
     topics = topics_of(path)
@@ -221,7 +206,7 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     bag.track.source = odometer
     # Counts of moving transforms, by whether they have a stamp; a single stamped one suffices.
     stamped: Counter[bool] = Counter()
-    for message in messages(path, {**scans_on(chosen), ODOMETRY: {odometer}, TRANSFORMS: None}):
+    for message in messages(path, {**scans_on(chosen), ODOMETRY: {odometer}, TRANSFORMS: None}, skipped):
         for each in message.fields.transforms if message.kind == TRANSFORMS else (message.fields,):
             try:
                 _take(bag, message, each)
@@ -293,7 +278,7 @@ def is_static(message: Message) -> bool:
 def transforms_of(path: Path, skipped: Skipped, *, by_the_clock: bool = False) -> TransformBuffer:
     """Read the transforms of a bag, at the log's times if they have no stamps (``by_the_clock``)."""
     buffer = TransformBuffer()
-    for message in messages(path, {TRANSFORMS: None}):
+    for message in messages(path, {TRANSFORMS: None}, skipped):
         for each in message.fields.transforms:
             try:
                 buffer.add(each, is_static(message), message.time if by_the_clock else None)

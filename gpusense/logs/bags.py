@@ -30,6 +30,7 @@ from gpusense.logs.bag_storage import MCAP, ROS1, SQLITE, ZSTD, Mcap, Ros1, Sqli
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 ECHOES = "sensor_msgs/msg/MultiEchoLaserScan"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+CHUNKS = "broken pieces"
 # ROS 1's two versions of transforms have one layout.
 _SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}
 
@@ -42,6 +43,33 @@ class Message(NamedTuple):
     topic: str
     time: float
     fields: Any
+
+
+class Skipped:
+    """Messages and transforms that break a rule, and chunks of messages that cannot be read."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._reason = ""
+
+    def add(self, message: Message, error: Exception) -> None:
+        """Count a message, or a chunk."""
+        self._reason = self._reason or f"{message.where.rpartition(': ')[2]}: {error}"
+        self._counts[message.topic] += 1
+
+    def warn(self, path: Path) -> None:
+        """Warn with the counts by topic."""
+        if total := self._counts.total():
+            each = ", ".join(
+                f"{number} {CHUNKS}" if topic == CHUNKS else f"{number} on {topic}"
+                for topic, number in sorted(self._counts.items())
+            )
+            warn_user(f"{path}: skipped messages: {total} ({each}); the first is {self._reason}")
+
+    def reason(self, topic: str) -> str:
+        """Return the count of a topic and the first error; empty for a topic without skipped messages."""
+        number = self._counts[topic] + self._counts[CHUNKS]
+        return f" but {number} that are skipped ({self._reason})" if number else ""
 
 
 def topics_of(path: Path) -> dict[str, list[str]]:
@@ -61,22 +89,24 @@ def topics_of(path: Path) -> dict[str, list[str]]:
     return found
 
 
-def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Message]:
-    """Read messages of the wanted topics of each type (None for all) in order; of several echoes the first one."""
+def messages(path: Path, wanted: Mapping[str, set[str] | None], skipped: Skipped | None = None) -> Iterator[Message]:
+    """Read messages of the wanted topics of each type (None for all) in order; of several echoes the first one.
+
+    Messages and chunks that cannot be decoded are added to ``skipped``.
+    """
 
     def chosen(topic: Topic) -> bool:
         names = wanted.get(_known(topic).kind, set())
         return names is None or topic.name in names
 
     place = str(path)
-    first = is_ros1(path)
+    skipped = Skipped() if skipped is None else skipped
     library("rosbags.typesys", f"{path}: a ROS bag")
-    store = type_store(first)
     numbers: Counter[str] = Counter()
     with errors_at(place):
         files = storages(path)
     for file in files:
-        stream = file.messages(chosen)
+        stream, store = file.messages(chosen), type_store(file.ros1)
         while True:
             with errors_at(place):
                 raw = next(stream, None)
@@ -85,12 +115,19 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
             kind, name = _known(raw.topic)
             numbers[name] += 1
             where = f"{path}: {name}, message {numbers[name]}"
-            with errors_at(where):
-                data = raw.data if first else unpacked(raw.data)
-                fields = (store.deserialize_ros1 if first else store.deserialize_cdr)(data, kind)
-                if kind == ECHOES:
-                    kind, fields = SCAN, _first_echo(fields)
-            yield Message(where, kind, name, raw.time / 1e9, fields)
+            message = Message(where, kind, name, raw.time / 1e9, None)
+            try:
+                with errors_at(where):
+                    data = raw.data if file.ros1 else unpacked(raw.data)
+                    fields = (store.deserialize_ros1 if file.ros1 else store.deserialize_cdr)(data, kind)
+                    if kind == ECHOES:
+                        message, fields = message._replace(kind=SCAN), _first_echo(fields)
+            except ValueError as error:
+                skipped.add(message, ValueError(str(error).removeprefix(f"{where}: ")))
+                continue
+            yield message._replace(fields=fields)
+        for at, reason in file.broken.items():
+            skipped.add(Message(f"{place}: {file.file.name}, byte {at}", "", CHUNKS, 0.0, None), reason)
 
 
 def _known(topic: Topic) -> Topic:
@@ -144,13 +181,6 @@ def begins(file: Path, *firsts: bytes) -> bool:
         return stream.read(max(map(len, firsts))).startswith(firsts)
 
 
-def is_ros1(path: Path) -> bool:
-    """Return whether a bag is from ROS 1, by its first bytes, or by its suffix if the bytes are unknown."""
-    if path.is_dir() or begins(path, MCAP, SQLITE, ZSTD):
-        return False
-    return begins(path, ROS1) or path.suffix.lower() == ".bag"
-
-
 def is_bag_folder(folder: Path) -> bool:
     """Return whether a folder is a ROS 2 bag."""
     return (folder / "metadata.yaml").is_file() or bool(_parts(folder))
@@ -168,7 +198,17 @@ def storages(path: Path) -> list[Storage]:
         _check_parts(metadata, files)
     elif packed:
         raise ValueError(f"{packed[0]}: must be decompressed in a folder without metadata.yaml, got a zstd file")
-    return sorted(map(_storage, files), key=lambda each: each.start)
+    found: list[Storage] = []
+    for file in files:
+        try:
+            with errors_at(str(file)):
+                found.append(_storage(file))
+        except ValueError as error:
+            found.append(Storage(file))
+            found[-1].broken[0] = error
+    if found and all(type(each) is Storage for each in found):
+        raise found[0].broken[0]
+    return sorted(found, key=lambda each: each.start)
 
 
 def _check_parts(metadata: Path, files: list[Path]) -> None:

@@ -11,7 +11,8 @@ ODOM                   x y theta, tv, rv, acceleration
 =====================  =================================================================================
 
 Each message ends with the time of measurement, the host and the logger's time. FLASER and ROBOTLASER1 come from the
-front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is skipped.
+front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is skipped. So are messages that break the
+format, with one warning; they are an error unless most messages are sound.
 
 * ``Scan.time`` and ``Odometry.time`` are the time of measurement.
 * ``Scan.pose`` is the laser's pose. It is corrected in a log processed by SLAM, and odometry in a raw log; the file
@@ -25,9 +26,11 @@ front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is ski
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import gzip
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -35,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.files import write_whole
-from gpusense._util.lines import numbers_in, until_cut
+from gpusense._util.lines import numbered_lines, numbers_in, until_cut
 from gpusense.logs.records import Odometry, Pose, Scan, even_bearings
 from gpusense.world.scanner import Scanner
 
@@ -49,16 +52,16 @@ def read(
     path: Path, *, range_max: float | None, range_min: float | None, odometry: bool, rear: bool
 ) -> Iterator[Scan | Odometry]:
     """Read the records of a CARMEN log; see :func:`gpusense.read_log` for arguments and errors."""
-    names = _REAR if rear else _FRONT
-    return until_cut(path, lambda lines: _records(path, lines, names, (range_max, range_min or 0.0), odometry))
+    names, limits = _REAR if rear else _FRONT, (range_max, range_min or 0.0)
+    scanners: dict[tuple[float, ...], Scanner] = {}
+    largest = functools.cache(lambda name: range_max or _range_max_of(path, name))
+    return until_cut(path, lambda lines: _records(path, lines, names, limits, odometry, scanners, largest), skip=True)
 
 
 def _records(
     path: Path, lines: Iterator[tuple[int, bytes]], names: tuple[bytes, bytes], limits: tuple[float | None, float],
-    odometry: bool,
+    odometry: bool, scanners: dict[tuple[float, ...], Scanner], largest: Callable[[bytes], float],
 ) -> Iterator[Scan | Odometry]:  # fmt: skip
-    scanners: dict[tuple[float, ...], Scanner] = {}
-    range_max = old_range_max = limits[0]
     for where, fields in _messages(path, lines):
         if fields[0] == b"ODOM":
             values = _message_numbers(where, fields, 6)
@@ -73,11 +76,9 @@ def _records(
             start, view, step, stated_max = config[1:5].tolist()
             # Both view and step are rounded to 1e-6.
             finer = view / (ranges.size - 1) if ranges.size > 1 else step
-            geometry = start, finer if abs(finer - step) <= 1e-6 else step, ranges.size, range_max or stated_max
+            geometry = start, finer if abs(finer - step) <= 1e-6 else step, ranges.size, limits[0] or stated_max
         else:
-            if old_range_max is None:
-                old_range_max = _range_max_of(path, fields[0])
-            geometry = -math.pi / 2, _old_step(ranges.size), ranges.size, old_range_max
+            geometry = -math.pi / 2, _old_step(ranges.size), ranges.size, largest(fields[0])
         scanner = scanners.get(geometry)
         if scanner is None:
             start, step, count, farthest = geometry
@@ -165,17 +166,14 @@ def _old_step(count: int) -> float:
 def _range_max_of(path: Path, name: bytes) -> float:
     """Return range_max of a log's messages of one name, from their largest reading; see ``read_log``."""
     largest, times = 0.0, 0
-
-    def each(lines: Iterator[tuple[int, bytes]]) -> Iterator[NDArray[np.float64]]:
-        for where, fields in _messages(path, lines):
-            if fields[0] == name:
-                yield _laser(where, fields)[1]
-
-    for ranges in until_cut(path, each):
-        top = float(np.max(ranges, where=np.isfinite(ranges), initial=0.0))
-        if top > largest:
-            largest, times = top, 0
-        times += int(np.count_nonzero(ranges == largest))
+    for where, fields in _messages(path, numbered_lines(path)):
+        if fields[0] == name:
+            with contextlib.suppress(ValueError):
+                ranges = _laser(where, fields)[1]
+                top = float(np.max(ranges, where=np.isfinite(ranges), initial=0.0))
+                if top > largest:
+                    largest, times = top, 0
+                times += int(np.count_nonzero(ranges == largest))
     if largest == 0.0:
         raise ValueError(f"{path}: must have a reading > 0 unless range_max is given, got none")
     return largest if times >= 3 else math.nextafter(largest, math.inf)

@@ -118,8 +118,8 @@ def read_log(
         TypeError: An argument has the wrong type.
         ValueError: A limit of ranges breaks its rule, an option does not suit the format, or a folder is no bag.
         ImportError: While reading a ROS bag, the library rosbags cannot be imported.
-        ValueError: While reading, a message breaks the format; the error names the file and the line, or the topic and
-            the message's number.
+        ValueError: While reading, the file or most messages break the format; the error names the file and the place. A
+            warning counts the messages that are skipped.
 
     Example:
         >>> import gpusense as gs, pathlib, tempfile

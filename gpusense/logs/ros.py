@@ -21,8 +21,8 @@ All other messages are skipped without decoding; message definitions within a ba
   degrees has a mount for each scan. The mount is (0, 0, 0), with a warning, if transforms are absent. The bearings of
   a laser that is mounted upside down run clockwise.
 * Poses that are not level keep only x, y and yaw, with a warning.
-* Messages and transforms with numbers that are not finite, or a quaternion of 0, are skipped; one warning counts
-  them.
+* Messages and transforms with numbers that are not finite, or a quaternion of 0, are skipped, as are messages and
+  chunks that cannot be decoded; one warning counts them.
 * A last beam that repeats the first beam's direction is dropped. A reading of exactly 0, "none" to all drivers,
   becomes NaN. Other readings are copied: infinities are "no return", NaN is missing (REP-117).
 * The scanner has the beams and limits of most scans. Readings of other scans move to its nearest beams, at most half a
@@ -47,7 +47,6 @@ from gpusense.logs.bag_beams import Beams, shared_beams
 from gpusense.logs.bag_survey import (
     BASES,
     Bag,
-    Skipped,
     Track,
     bases_of,
     frame_of,
@@ -57,7 +56,7 @@ from gpusense.logs.bag_survey import (
     transforms_of,
     warn_of_tilt,
 )
-from gpusense.logs.bags import ODOMETRY, TRANSFORMS, Message, messages, topics_of
+from gpusense.logs.bags import ODOMETRY, TRANSFORMS, Message, Skipped, messages, topics_of
 from gpusense.logs.records import Odometry, Pose, Scan, planar, planar_mount
 from gpusense.logs.transform_buffer import TransformError
 from gpusense.world.messages import LEVEL, planar_covariance, planar_part, stamp_of, tilt_of
@@ -279,7 +278,7 @@ def _names(known: dict[str, str], has_transforms: bool) -> str:
 
 def _of_topic(path: Path, kind: str, topic: str, map_frame: str) -> PoseTrack:
     track, covariances, frames, skipped = Track(topic), [], set(), Skipped()
-    for message in messages(path, {kind: {topic}}):
+    for message in messages(path, {kind: {topic}}, skipped):
         try:
             pose, tilt = planar_part("message.pose", field_of("message", message.fields, _KINDS[kind]))
             stated = None if kind == POSE else field_of("message", message.fields, "pose.covariance")

@@ -39,13 +39,13 @@ def read(
     if rear:
         raise ValueError("rear: must be False for a Wean Hall log, whose robot has one laser, got True")
     limits = range_max or _RANGE_MAX, range_min or 0.0
-    return until_cut(path, lambda lines: _records(path, lines, limits, odometry))
+    scanners: list[Scanner] = []
+    return until_cut(path, lambda lines: _records(path, lines, limits, odometry, scanners), skip=True)
 
 
 def _records(
-    path: Path, lines: Iterator[tuple[int, bytes]], limits: tuple[float, float], odometry: bool
+    path: Path, lines: Iterator[tuple[int, bytes]], limits: tuple[float, float], odometry: bool, scanners: list[Scanner]
 ) -> Iterator[Scan | Odometry]:
-    scanner: Scanner | None = None
     for number, line in lines:
         fields = line.split()
         if not fields:
@@ -58,9 +58,10 @@ def _records(
                 yield Odometry(float(values[-1]), pose)
             continue
         mount = _mount(pose, (float(values[3]) / 100, float(values[4]) / 100, float(values[5])))
-        if scanner is None:
+        if not scanners:
             bearings = -math.pi / 2 + math.pi / _BEAMS * np.arange(_BEAMS)
-            scanner = Scanner(bearings, *limits, mount)
+            scanners.append(Scanner(bearings, *limits, mount))
+        scanner = scanners[0]
         apart = max(math.dist(mount[:2], scanner.mount[:2]), abs(math.remainder(mount[2] - scanner.mount[2], math.tau)))
         if apart > _MOVED:
             raise ValueError(f"{where}: L: the laser must stay at {scanner.mount} on the robot, got {mount}")

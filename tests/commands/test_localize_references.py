@@ -296,7 +296,12 @@ def test_scans_without_a_pose_are_neither_used_nor_checked(place, capsys, tmp_pa
     assert cli.main([*command, "--reference", str(tmp_path / "known.tum")]) == 0
     out, err = capsys.readouterr()
     assert "MAPPED: 3 scans at reference poses" in out and f"has poses of 3 of {COUNT + 1} chosen scans" in err
-    assert "must come from the same scanner, got another at scan 3 of" in error_of(command, capsys)
+    assert "left out" not in err
+    # Without a reference the odd scan is left out; half of the scans are not.
+    steps = read_steps(tmp_path / "mixed.log", range_max=20.0, limit=6)
+    assert [step.index for step in steps] == [0, 1, 2, 4, 5]
+    with pytest.raises(ValueError, match="must come from the same scanner, got another at scan 3 of"):
+        read_steps(tmp_path / "mixed.log", range_max=20.0, offset=2, limit=2)
 
 
 def test_a_trajectory_of_indices_is_not_taken_for_times(place, capsys, tmp_path):

@@ -1,9 +1,10 @@
-"""Bags that grow without bound, in chunks, messages, files and YAML; poses of bags."""
+"""Bags that grow without bound, in chunks, messages, files and YAML, or are broken in parts; poses of bags."""
 
 from __future__ import annotations
 
 import math
 import shutil
+import struct
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import BASE, LASER, Writer
+from support.bags import BASE, LASER, SCAN, Writer, read
 
 import gpusense as gs
 from gpusense.logs import bag_storage, bags
@@ -177,3 +178,87 @@ def test_a_bag_whose_file_does_not_fit_the_disk(tmp_path: Path, monkeypatch: Any
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
     with pytest.raises(ValueError, match="the disk's room"):
         list(gs.read_log(path))
+
+
+# ---- pieces that cannot be read, and content of other programs
+
+
+def long_bag(folder: Path, form: str, compression: str = "") -> Path:
+    """Write a bag of 200 scans in chunks of about 3000 bytes; return its file."""
+    bag = Writer(folder, form)
+    if compression:
+        bag.writer.set_compression(bag.writer.CompressionFormat[compression])
+    with bag:
+        bag.writer.chunk_threshold = 3000
+        for k in range(200):
+            bag.scan(10.5 + k, np.linspace(1, 5, 100) + k / 1000, -0.5, 0.01)
+    return bag.path if bag.path.is_file() else next(f for f in bag.path.iterdir() if f.suffix in (".db3", ".mcap"))
+
+
+@pytest.mark.parametrize(("form", "compression"), [("ros1", "BZ2"), ("ros1", "LZ4"), ("ros1", ""), ("sqlite3", "")])
+def test_a_broken_piece_of_a_file_does_not_close_it(tmp_path: Path, form: str, compression: str) -> None:
+    file = long_bag(tmp_path, form, compression)
+    whole = {scan.time: scan.ranges.tolist() for scan in read(file, mount=(0, 0, 0))[0]}
+    data = bytearray(file.read_bytes())
+    if form == "sqlite3":
+        middle = len(data) // 8192 * 4096
+        data[middle : middle + 8] = bytes(range(200, 208))
+    else:
+        # The first record of a chunk: its header, and compressed data.
+        begin = data.index(b"compression=", len(data) // 2) + 40
+        begin = data.index(b"op=", begin) - 8 if not compression else begin
+        data[begin : begin + 16] = b"\xff" * 16
+    file.write_bytes(data)
+    scans, told = read(file, mount=(0, 0, 0))
+    assert 180 <= len(scans) < 200 and all(whole[scan.time] == scan.ranges.tolist() for scan in scans)
+    assert len(told) == 1 and "skipped messages: 1 (1 broken pieces); the first is run." in told[0]
+
+
+def test_a_broken_file_of_a_folder_is_named_and_the_others_are_read(tmp_path: Path) -> None:
+    file = long_bag(tmp_path, "sqlite3")
+    (file.parent / "other.db3").write_bytes(bag_storage.SQLITE + bytes(50))
+    scans, told = read(file.parent, mount=(0, 0, 0))
+    assert len(scans) == 200 and len(told) == 1 and "1 broken pieces); the first is other.db3, byte 0: " in told[0]
+    file.unlink()
+    (file.parent / "metadata.yaml").unlink()
+    with pytest.raises(ValueError, match=r"other\.db3: must be a sound ROS message or bag"):
+        read(file.parent)
+
+
+def mcap(path: Path, form: str, encoding: str, profile: bytes = b"ros2") -> Path:
+    """Write a file of 3 scans, encoded as in another bag, with a record of an extension and a topic in JSON."""
+    with Writer(path.parent, form, "source") as bag:
+        for k in range(3):
+            bag.scan(1.0 + k, [2.0] * 5, -0.2, 0.1)
+    file = bags.storages(bag.path)[0]
+
+    def text(value: bytes) -> bytes:
+        return struct.pack("<I", len(value)) + value
+
+    def record(kind: int, data: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(data)) + data
+
+    scan = b"sensor_msgs/LaserScan" if form == "ros1" else SCAN.encode()
+    parts = [record(1, text(profile) + text(b"")), record(0x81, b"an extension")]
+    topics = ((b"/scan", scan, encoding.encode()), (b"/log", b"foxglove.Log", b"json"))
+    for number, (name, kind, code) in enumerate(topics, 1):
+        parts.append(record(3, struct.pack("<H", number) + text(kind) + text(b"") + text(b"")))
+        parts.append(record(4, struct.pack("<HH", number, number) + text(name) + text(code) + text(b"")))
+    messages = [(1, raw.time, raw.data) for raw in file.messages(lambda topic: True)]
+    for number, time, data in [*messages, (2, 5, b"{}")]:
+        parts.append(record(5, struct.pack("<HIQQ", number, 0, time, time) + data))
+    path.write_bytes(b"".join([bag_storage.MCAP, *parts, record(15, bytes(4)), record(2, bytes(20)), bag_storage.MCAP]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "encoding", "profile"), [("mcap", "cdr", b"ros2"), ("mcap", "cdr", b""), ("ros1", "ros1", b"ros1")]
+)
+def test_topics_and_records_of_other_programs_are_passed_over(tmp_path, form, encoding, profile) -> None:
+    scans, told = read(mcap(tmp_path / "a.mcap", form, encoding, profile), mount=(0, 0, 0))
+    assert [scan.ranges.tolist() for scan in scans] == [[2.0] * 5] * 3 and told == []
+
+
+def test_scans_of_an_unknown_encoding_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"got /log \(foxglove.Log as json\), /scan \(.*LaserScan as protobuf\)$"):
+        read(mcap(tmp_path / "a.mcap", "mcap", "protobuf"))

@@ -146,7 +146,7 @@ def test_new_messages_with_six_decimals_lose_no_angle(log):
 
 
 def test_reading_is_lazy(log):
-    records = read_log(log(flaser([1.0]), flaser([1.0]), "FLASER broken"), range_max=5.0)
+    records = read_log(log(flaser([1.0]), flaser([1.0]), *["FLASER broken"] * 2), range_max=5.0)
     next(records)
     next(records)
     with pytest.raises(ValueError, match=r"run.log:3: FLASER: field 1 must be a count"):

@@ -95,17 +95,28 @@ def test_a_log_is_read_up_to_a_cut_in_its_last_line(tmp_path, lines, packed, sha
 
 
 @pytest.mark.parametrize("lines", [CARMEN, WEAN], ids=["CARMEN", "Wean Hall"])
-def test_a_last_line_without_an_end_is_whole_and_others_are_errors(tmp_path, lines):
+def test_a_last_line_without_an_end_is_whole_and_a_few_bad_lines_are_skipped(tmp_path, lines):
     path = tmp_path / "run.log"
     path.write_text("\n".join(lines))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert count(path) == 6
-    # With a line break, and in the middle.
-    for text in ("\n".join([*lines, lines[0][:30], ""]), "\n".join([lines[0], lines[1][:30], *lines])):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=r"run\.log:"):
-            count(path)
+    # With a line break, in the middle, at the start, and two before a cut line.
+    bad, end = lines[1][:30], "file ends in the middle"
+    for each, good, rules in (
+        ([*lines, bad, ""], 6, ["lines: 1; the first is line 7: "]),
+        ([*lines[:2], bad, *lines[2:]], 6, ["is line 3: "]),
+        ([bad, *lines], 6, ["is line 1: "]), ([bad, *lines[:4], bad, bad], 4, [end, "lines: 2; the first is line 1: "]),
+    ):  # fmt: skip
+        path.write_text("\n".join(each))
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            assert count(path) == good
+        assert len(told) == len(rules) and all(rule in str(one.message) for rule, one in zip(rules, told, strict=True))
+    # Most lines are bad.
+    path.write_text("\n".join([lines[0], bad, bad, bad, ""]))
+    with pytest.raises(ValueError, match=r"run\.log:2: "):
+        count(path)
     # The cut line alone.
     path.write_text(lines[0][:30])
     with pytest.raises(ValueError, match=r"run\.log"):

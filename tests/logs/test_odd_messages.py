@@ -75,6 +75,11 @@ def nothing(bag: Writer, time: float) -> None:
     """Write no odd message."""
 
 
+def undecodable(bag: Writer, topic: str, time: float) -> None:
+    """Write a message that ends too early."""
+    bag.writer.write(bag.connections[topic], round(time * 1e9), b"\0\1\0\0\1")
+
+
 ODD: dict[str, tuple[Any, str]] = {
     "tf-place": (lambda bag, t: bag.transform(t, "map", "odom", (NAN, 0), 0.0, topic="/tf"), "1 on /tf"),
     "tf-turn": (lambda bag, t: bag.transform(t, BASE, "arm", (0, 0), 0.0, topic="/tf", turn=(0, 0, 0, 0)), "1 on /tf"),
@@ -86,6 +91,9 @@ ODD: dict[str, tuple[Any, str]] = {
     "odom-nan": (lambda bag, t: bag.odometry(t, 9.0, 0.0, 0.0, turn=(NAN,) * 4), "1 on /odom"),
     "scan-first": (lambda bag, t: bag.scan(t, [2.0] * 5, NAN, 0.1), "1 on /scan"),
     "scan-step": (lambda bag, t: bag.scan(t, [2.0] * 5, 0.0, INF), "1 on /scan"),
+    "scan-bytes": (lambda bag, t: undecodable(bag, "/scan", t), "1 on /scan"),
+    "static-bytes": (lambda bag, t: undecodable(bag, "/tf_static", t), "1 on /tf_static"),
+    "odom-bytes": (lambda bag, t: undecodable(bag, "/odom", t), "1 on /odom"),
     "scan-still": (lambda bag, t: bag.scan(t, [2.0] * 5, 0.0, 0.0), "1 on /scan"),
 }
 
@@ -280,6 +288,17 @@ def test_simulated_time_begins_at_zero(tmp_path: Path, kind: str, topic: str) ->
         expected = [wall_time + k for k in range(3)] if name == "none" else stamps
         assert [scan.time for scan in scans] == expected and told == []
         assert [scan.odometry[0] for scan in scans] == [1.0, 2.0, 3.0][: len(stamps)]
+
+
+@pytest.mark.parametrize("stamps", [[1.0, 4.0, 0.0, 5.0], [11.0, 12.0, 1.0, 2.0]])
+def test_stamps_that_go_back_are_pointed_out(tmp_path: Path, stamps: list[float]) -> None:
+    with Writer(tmp_path, "ros1") as bag:
+        for k, stamp in enumerate(stamps):
+            bag.odometry(10.0 + k, float(k), 0.0, 0.0)
+            bag.scan(10.0 + k, [2.0] * 5, -0.2, 0.1, stamp=stamp)
+    scans, told = read(bag.path, mount=(0, 0, 0))
+    assert [scan.time for scan in scans] == stamps
+    assert "the stamps of scans go back 1 times, by up to " + f"{stamps[1] - stamps[2]:g} s" in told[0]
 
 
 def test_scans_and_odometry_at_other_times_are_pointed_out(tmp_path: Path) -> None:

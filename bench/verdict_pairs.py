@@ -15,7 +15,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.evaluation.log_steps import read_steps
-from gpusense.evaluation.matching import WRONG, WRONG_TURN, relative_poses
+from gpusense.evaluation.matching import WRONG, WRONG_TURN
 from gpusense.evaluation.worlds import free_pose
 from gpusense.matching.result import ScanMatch
 
@@ -101,7 +101,7 @@ def recorded_pairs(name: str, count: int, seed: int) -> Iterator[Pairs]:
     half, rng = "A" if name in HALF_A else "B", np.random.default_rng(seed)
 
     def made(kind: str, i: np.ndarray, j: np.ndarray, guess: np.ndarray | None = None) -> Pairs:
-        truth = relative_poses(poses[i], poses[j])
+        truth = gs.pose_difference(poses[i], poses[j])
         if guess is None:
             guess = (0 if kind == "unrelated" else truth) + rng.uniform(-1, 1, truth.shape) * GUESS
         return Pairs(half, name, kind, scanner, ranges[i], ranges[j], guess, truth)
@@ -109,7 +109,7 @@ def recorded_pairs(name: str, count: int, seed: int) -> Iterator[Pairs]:
     for step, kind in ((1, "successive"), (3, "near")):
         i = rng.integers(0, len(ranges) - step, count)
         i = i[np.hypot(*(poses[i + step] - poses[i]).T[:2]) < 3]
-        yield made(kind, i, i + step, relative_poses(odometry[i], odometry[i + 1]) if step == 1 else None)
+        yield made(kind, i, i + step, gs.pose_difference(odometry[i], odometry[i + 1]) if step == 1 else None)
     i, j = rng.integers(0, len(ranges), (2, 60 * count))
     apart = np.hypot(*(poses[j] - poses[i]).T[:2])
     for kind, low, high, most in (("places", 1.0, 4.0, count // 2), ("unrelated", UNRELATED, np.inf, 2 * count)):
@@ -164,11 +164,11 @@ def simulated_pairs(backend: str, count: int, seed: int) -> Iterator[Pairs]:
                 ]) for scans in exact
             )  # fmt: skip
             label = f"{name}, {scanner.count} beams, {100 * noise:g} cm"
-            truth = relative_poses(first, second)
+            truth = gs.pose_difference(first, second)
             guess = truth + rng.uniform(-1, 1, truth.shape) * GUESS
             yield Pairs("S", label, "near", scanner, one, two, guess, truth)
             other = np.roll(np.arange(len(two)), len(two) // 2)
-            truth = relative_poses(first, second[other])
+            truth = gs.pose_difference(first, second[other])
             far = np.hypot(truth[:, 0], truth[:, 1]) > UNRELATED_SIMULATED
             guess = rng.uniform(-1, 1, truth.shape) * GUESS
             if far.any():

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.evaluation.matching import WRONG, WRONG_TURN, differences, relative_poses
+from gpusense.evaluation.matching import WRONG, WRONG_TURN, differences
 from gpusense.evaluation.worlds import free_pose
 from gpusense.matching.points import match_noise, scan_noise
 from gpusense.matching.result import ScanMatch
@@ -72,7 +72,7 @@ def corridors(backend: str, count: int, seed: int) -> list[list[str]]:
                     scans = [
                         corridor_scan(p, scanner) + noise * rng.normal(size=(count, beams)) for p in (first, second)
                     ]
-                    truth = relative_poses(first, second)
+                    truth = gs.pose_difference(first, second)
                     guess = truth + 0.3 * np.array([np.cos(heading), -np.sin(heading), 0.0])
                     match = gs.match_scan(*scans, scanner, guess, backend=backend)
                     deviation = np.sqrt(np.einsum("sii->si", match.covariance))
@@ -144,7 +144,7 @@ def loop_squares(matches: list[ScanMatch]) -> tuple[np.ndarray, np.ndarray]:
     """Return squared loop errors over predicted ones (S,), and loop errors, of matches i to j, j to k, and i to k."""
     one, two, both = matches
     end = composed(one.pose, two.pose)
-    loop = relative_poses(both.pose, end)
+    loop = gs.pose_difference(both.pose, end)
     # Derivatives of the end, in the frame of scan k by the third match, with respect to the three poses.
     c, s = np.cos(both.pose[:, 2]), np.sin(both.pose[:, 2])
     zero, unit = np.zeros(len(c)), np.ones(len(c))
@@ -177,7 +177,7 @@ def loops(name: str, backend: str, count: int, seed: int) -> list[str]:
         (i + step, i + 2 * step, even, even),
         (i, i + 2 * step, even, odd),
     ):
-        truth = relative_poses(poses[first], poses[second])
+        truth = gs.pose_difference(poses[first], poses[second])
         match = gs.match_scan(ranges[first] + a, ranges[second] + b, scanner, truth, backend=backend, noise=noise)
         matches.append(match)
         distance, turn = differences(match.pose, truth)
@@ -185,9 +185,9 @@ def loops(name: str, backend: str, count: int, seed: int) -> list[str]:
     good = np.logical_and.reduce(errors)
     squares, loop = loop_squares([ScanMatch.ordered(match, np.flatnonzero(good)) for match in matches])
     whole = gs.match_scan(
-        ranges[i], ranges[i + step], scanner, relative_poses(poses[i], poses[i + step]), backend=backend
+        ranges[i], ranges[i + step], scanner, gs.pose_difference(poses[i], poses[i + step]), backend=backend
     )
-    off = off_by(whole, relative_poses(poses[i], poses[i + step]))
+    off = off_by(whole, gs.pose_difference(poses[i], poses[i + step]))
     right = whole.converged & (np.hypot(off[:, 0], off[:, 1]) < WRONG) & (np.abs(off[:, 2]) < WRONG_TURN)
     reference = np.einsum("si,sij,sj->s", off[right], np.linalg.inv(whole.covariance[right]), off[right]) / 3
     deviation = np.sqrt(np.einsum("sii->si", whole.covariance[right])[:, :2].sum(axis=1))
@@ -215,7 +215,7 @@ def nees_simulated(backend: str, count: int, seed: int) -> list[list[str]]:
                 exact = [caster.cast(poses, scanner.bearings).astype(np.float64) for poses in (first, second)]
                 seen = (exact[0].min(axis=1) > 0.1) & (exact[1].min(axis=1) > 0.1)
                 one, two = (z[seen] + noise * rng.normal(size=z[seen].shape) * (z[seen] < 30.0) for z in exact)
-                truth = relative_poses(first, second)[seen]
+                truth = gs.pose_difference(first, second)[seen]
                 guess = truth + rng.uniform(-1, 1, truth.shape) * (0.1, 0.1, 0.05)
                 match = gs.match_scan(one, two, scanner, guess, backend=backend)
                 off = off_by(match, truth)
@@ -245,7 +245,7 @@ def few(backend: str, count: int, seed: int) -> list[list[str]]:
                 exact = [caster.cast(poses, scanner.bearings).astype(np.float64) for poses in (first, second)]
                 seen = (exact[0].min(axis=1) > 0.1) & (exact[1].min(axis=1) > 0.1)
                 one, two = (np.where(z < 20, z + rng.normal(0, 0.01, z.shape), np.inf)[seen] for z in exact)
-                truth = second[seen] if to == "map" else relative_poses(first, second)[seen]
+                truth = second[seen] if to == "map" else gs.pose_difference(first, second)[seen]
                 guess = truth + rng.uniform(-1, 1, truth.shape) * (0.15, 0.15, 0.08)
                 matches.append(gs.match_scan(grid if to == "map" else one, two, scanner, guess, backend=backend))
                 truths.append(truth)

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.evaluation.matching import WRONG, WRONG_TURN, differences, relative_poses
+from gpusense.evaluation.matching import WRONG, WRONG_TURN, differences
 from gpusense.evaluation.worlds import free_pose
 from gpusense.matching.result import ScanMatch
 
@@ -150,7 +150,7 @@ def simulated(data: Path | None, backend: str, count: int, seed: int) -> list[di
         one, two = (caster.cast(poses, SCANNER.bearings).astype(np.float64) for poses in (first, second))
         # Poses in walls see nothing.
         seen = (one.min(axis=1) > 0.1) & (two.min(axis=1) > 0.1)
-        one, two, truth = one[seen], two[seen], relative_poses(first, second)[seen]
+        one, two, truth = one[seen], two[seen], gs.pose_difference(first, second)[seen]
         guess = truth + rng.uniform(-1, 1, truth.shape) * (SHIFT, SHIFT, TURN)
         for noise in (0.0, 0.02):
             a, b = (scan + rng.normal(0, noise, scan.shape) * (scan < SCANNER.range_max) for scan in (one, two))

@@ -13,7 +13,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import Backend
-from gpusense.evaluation.matching import differences, relative_poses
+from gpusense.evaluation.matching import differences
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -59,7 +59,7 @@ def pairs(device: Backend) -> Iterator[Pairs]:
     first = free_poses(grid, PAIRS, rng)
     second = first + rng.uniform(-1, 1, first.shape) * (1.0, 1.0, np.radians(30))
     off = rng.uniform(-1, 1, first.shape) * (0.5, 0.5, np.radians(10))
-    truth = relative_poses(first, second)
+    truth = gs.pose_difference(first, second)
     for count in BEAMS:
         scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=2 * np.pi / count, count=count, range_max=20.0)
         caster = gs.RayCaster(grid, scanner.range_max, backend=device)

@@ -10,12 +10,13 @@ the log-likelihood of some known pose is evaluated by the model.
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -95,11 +96,35 @@ class FieldSearch:
                 beyond=TOP if self._walled else 0,
             )
         )  # fmt: skip
-        self.caster = RayCaster(model.grid, model.scanner.range_max, backend=backend, unknown=unknown, outside=outside)
-        self.smooth = LikelihoodFieldModel(
-            model.grid, model.scanner, replace(p, interpolation="bilinear"), backend=backend,
-            precision=model.precision, unknown=unknown, outside=outside, beams=model.beams,
+        # Scans may be anywhere: a table of a part of the map would be made again and again.
+        rows, cols = model.grid.shape
+        self._corners = to_world(model.grid, np.array([(0, 0, 0), (cols, 0, 0), (0, rows, 0), (cols, rows, 0)], float))
+        model.prepare(self._corners)
+        self._options: Any = dict(backend=backend, unknown=unknown, outside=outside)
+
+    @functools.cached_property
+    def caster(self) -> RayCaster:
+        """A caster of the model's map."""
+        caster = RayCaster(self.grid, self._kept_model.scanner.range_max, **self._options)
+        caster.prepare(self._corners)
+        return caster
+
+    @functools.cached_property
+    def smooth(self) -> LikelihoodFieldModel:
+        """The model with interpolated distances."""
+        model = self._kept_model
+        smooth = LikelihoodFieldModel(
+            self.grid, model.scanner, replace(model.parameters, interpolation="bilinear"), precision=model.precision,
+            beams=model.beams, **self._options,
         )  # fmt: skip
+        smooth.prepare(self._corners)
+        return smooth
+
+    @property
+    def _kept_model(self) -> LikelihoodFieldModel:
+        model = self._model()
+        assert model is not None
+        return model
 
     def _tile_scores(self, density: FieldDensity, distances: np.ndarray) -> np.ndarray:
         """Return the largest scores (n (H + 1), n (W + 1)) of n x n tiles between four centres, rounded up."""
@@ -133,8 +158,7 @@ class FieldSearch:
         ``ranges`` are (S, K) readings [m], ``points`` (M, 2) end points of the hits of each scan on the robot [m], at
         least one. ``allowed`` are the positions that may be found; None: all.
         """
-        model = self._model()
-        assert model is not None
+        model = self._kept_model
         cells = [part / self.grid.resolution for part in points]
         most = [math.ceil(depth * TOP * len(part)) for part in points]
         if self._tiles:

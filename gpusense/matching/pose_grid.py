@@ -92,10 +92,12 @@ def distinct_poses(
     Poses (M, 3) of S scans, (M,) ascending in ``scan``, come by falling score; the best ones are in the rows ``best``
     (S,), None for the first row alone. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
     """
-    group = np.zeros(len(poses), np.intp) if scan is None else scan
-    firsts = np.append(True, group[1:] != group[:-1])[: len(group)].nonzero()[0]
+    if scan is None:
+        first = 0 if best is None else int(best[0])
+        return _distinct_of_one(poses, min(count, len(poses)), radius, angle, first)
+    firsts = np.append(True, scan[1:] != scan[:-1])[: len(scan)].nonzero()[0]
     last = firsts if best is None else best
-    chosen, sizes, x = [last], np.diff(np.append(firsts, len(group))), poses[:, 0].copy()
+    chosen, sizes, x = [last], np.diff(np.append(firsts, len(scan))), poses[:, 0].copy()
     group = np.repeat(np.arange(len(firsts)), sizes)
     for _ in range(count - 1 if len(group) else 0):
         # Most poses are far along x alone; poses that are left out are infinitely far.
@@ -114,4 +116,19 @@ def distinct_poses(
         last[some] = left.searchsorted(before[some] + 1)
         chosen.append(last[some])
     rows = np.concatenate(chosen)
-    return rows if scan is None else rows[np.argsort(scan[rows], kind="stable")]
+    return rows[np.argsort(scan[rows], kind="stable")]
+
+
+def _distinct_of_one(poses: np.ndarray, count: int, radius: float, angle: float, first: int) -> np.ndarray:
+    """Return the rows of distinct poses of a single scan, in fewer operations than those of several."""
+    chosen: list[int] = []
+    x, y, theta = poses.T.copy()
+    while len(chosen) < count and x[first] < np.inf:
+        chosen.append(first)
+        # Most poses are far along x alone; poses that are left out are infinitely far.
+        off_x = x - x[first]
+        near = (np.abs(off_x) <= radius).nonzero()[0]
+        off_x, off_y, turn = off_x[near], y[near] - y[first], wrapped(theta[near] - theta[first])
+        x[near[(off_x * off_x + off_y * off_y <= radius * radius) & (np.abs(turn) <= angle)]] = np.inf
+        first = int((x < np.inf).argmax())
+    return np.array(chosen, np.intp)

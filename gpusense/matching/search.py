@@ -41,6 +41,8 @@ _MOST_ITEMS, _MOST_BLOCKS, _MEMORY = 1 << 15, {"cpu": 1 << 25, "gpu": 1 << 29}, 
 # Poses of a scan that are read together with their number; by kind of device, work-items that divide blocks, and the
 # neighbouring blocks that each of them takes at a time.
 _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
+# Numbers of points are rounded up to multiples of this.
+_POINTS = 64
 # Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
 _TURN = (5**0.5 - 1) / 2
 # Arrays that place end points, and the numbers of arrays of placed points for each of them.
@@ -147,9 +149,10 @@ class _Run:
         each = [len(part) for part in points]
         orders = [*map(_order, each)]
         first = np.concatenate([[0], np.cumsum(np.repeat(each, self._turns))]).astype(np.int32)
-        # Buffers are never empty.
-        self._most, total = max(*each, 1), max(int(first[-1]), 1)
-        ends = np.concatenate([*(part[order] for part, order in zip(points, orders, strict=True)), np.zeros((1, 2))])
+        # Few sizes, which repeat although scans differ in their hits: repeated calls are started as graphs.
+        self._most, total = _rounded(max(each)), self._turns * _rounded(sum(each))
+        rest = np.zeros((_rounded(sum(each)) - sum(each), 2))
+        ends = np.concatenate([*(part[order] for part, order in zip(points, orders, strict=True)), rest])
         # The scans of a broadcast array share their headings.
         headings = grid.headings if grid.headings.strides[0] else grid.headings[:1]
         turned = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
@@ -158,7 +161,8 @@ class _Run:
         if images is not None:
             named = [np.broadcast_to(part, (self._turns, count))[:, order].reshape(-1)
                      for part, count, order in zip(images, each, orders, strict=True)]  # fmt: skip
-            given.append(np.concatenate([*named, [0]]).astype(np.int32))
+            named.append(np.zeros(total - int(first[-1]), np.int32))
+            given.append(np.concatenate(named).astype(np.int32))
         # The host places them for devices without float64.
         backend = self._backend if self._backend.info.float64 else get_backend("numpy")
         there = space if backend is self._backend else Workspace(backend)
@@ -351,6 +355,12 @@ class _Run:
         """Return the poses in falling order of score."""
         scan, row, col, heading, score = self._ordered()
         return Found(scan, row, col, heading, score, self._evaluated, self._complete)
+
+
+def _rounded(count: int) -> int:
+    """Return a number of points rounded up by at most an eighth, or to ``_POINTS``."""
+    step = max(_POINTS, 1 << max(count.bit_length() - 4, 0))
+    return max(-(-count // step), 1) * step
 
 
 @functools.lru_cache(maxsize=64)

@@ -11,7 +11,9 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.matching.field_search import field_search
 from gpusense.matching.locate import _refined
+from gpusense.world import windows
 
 PARAMETERS = gs.LikelihoodFieldParameters(sigma_hit=0.15, max_distance=1.0)
 
@@ -214,6 +216,18 @@ def test_a_changed_map_is_searched_anew():
     model.update_map(np.full((40, 1), 100), (4, 25))
     after = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
     assert before.status == "found" and after.status == "no match"
+
+
+def test_scans_all_over_a_long_map_share_its_tables(backend, monkeypatch):
+    """A scan reaches a small part of the map, and a table of that part would be made anew for the next scan."""
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 0)
+    grid = gs.OccupancyGrid(np.zeros((40, 800), int), 0.1)
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend=backend)
+    search = field_search(model, 1)
+    for kept in (model._field_pipeline.map, search.smooth._field_pipeline.map, search.caster._caster.map):
+        assert kept.window == windows.whole(grid)
+        table = kept.ensure([(5.0, 2.0, 0.0)]).table
+        assert kept.ensure([(75.0, 2.0, 0.0)]).table is table
 
 
 def test_a_default_model_is_searched_with_the_wide_field():

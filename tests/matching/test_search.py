@@ -9,6 +9,7 @@ import pytest
 
 from gpusense._util.angles import wrapped
 from gpusense.backends import get_backend
+from gpusense.backends.workspace import Workspace
 from gpusense.matching.pose_grid import distinct_poses
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
@@ -151,6 +152,40 @@ def test_exact_bounds_as_on_gpus_divide_fewer_blocks(name, monkeypatch, needs):
     for field in ("scan", "row", "col", "heading", "score"):
         np.testing.assert_array_equal(getattr(exact, field), getattr(rounded, field))
     assert exact.evaluated < rounded.evaluated
+
+
+def test_scans_of_other_lengths_repeat_launches_and_copies(monkeypatch):
+    """A CUDA graph keeps the sizes and numbers of its launches and copies."""
+    device, calls = get_backend("numpy"), []
+    compiled, copied = device.compile, Workspace.upload
+
+    def compile_and_note(kernel, flags):
+        launch = compiled(kernel, flags)
+
+        def noted(size, *arguments):
+            calls.append((kernel, size, *(one for one in arguments if isinstance(one, (int, float, tuple)))))
+            launch(size, *arguments)
+
+        return noted
+
+    def copy_and_note(self, name, array):
+        calls.append((name, array.shape, array.dtype))
+        return copied(self, name, array)
+
+    monkeypatch.setattr(device, "compile", compile_and_note)
+    monkeypatch.setattr(Workspace, "upload", copy_and_note)
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu"))
+    scores, _, grid = scene(1)
+    search = Search(ScoreTables(device, scores, levels=2))
+    rng, noted = np.random.default_rng(0), []
+    grid = PoseGrid(grid.start[:1], grid.headings[:1], grid.height, grid.width)
+    for count in (330, 340, 350):
+        calls.clear()
+        search.find([rng.uniform(-9, 9, (count, 2))], grid)
+        noted.append([*calls])
+    # The first search also makes tables.
+    assert len(noted[0]) > len(noted[1])
+    assert noted[1] == noted[2]
 
 
 def test_distinct_poses_are_those_of_a_greedy_choice():

@@ -119,11 +119,6 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 LEVELS = {"tracking": OK, "uncertain": WARN, "lost": ERROR}
 
 
-def radius_text(radius: float) -> str:
-    """Return a radius of protection with millimetres [m]; ``inf`` if none is promised."""
-    return f"{radius:.3f}"
-
-
 def status_fields(
     name: str, level: int, message: str, values: Mapping[str, str], node: str = "gpusense"
 ) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from gpusense.ros.conversions import (
     laser_scan,
     map_to_odometry,
     moved_enough,
-    radius_text,
     status_fields,
 )
 from gpusense.world.grid import OccupancyGrid
@@ -185,7 +184,7 @@ class Localizer:
         values |= {
             "verdict": found.verdict, "p_lost": f"{found.p_lost:.4f}", "explained": f"{found.explained:.3f}",
             "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
-            "radius": radius_text(found.protection_level(self.risk)), "risk": f"{self.risk:g}",
+            "radius": f"{found.protection_level(self.risk):.3f}", "risk": f"{self.risk:g}",
         }  # fmt: skip
         # The search for a cause takes milliseconds: do it once per estimate.
         if found.verdict != "tracking" and self._cause is None:

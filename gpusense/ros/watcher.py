@@ -15,7 +15,7 @@ from gpusense.evaluation.tracking import RISK
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor, PoseVerdict
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.ros.conversions import LEVELS, STALE, laser_scan, radius_text, start_of, status_fields
+from gpusense.ros.conversions import LEVELS, STALE, laser_scan, start_of, status_fields
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.messages import stamp_of
 from gpusense.world.scanner import Scanner
@@ -106,7 +106,7 @@ class Watcher:
         evidence = "" if likely is None else f": {likely.text}"
         values = {
             "p_lost": f"{found.p_lost:.4f}", "verdict": found.verdict, "explained": f"{found.explained:.3f}",
-            "radius": radius_text(found.protection_level(self.risk)), "risk": f"{self.risk:g}",
+            "radius": f"{found.protection_level(self.risk):.3f}", "risk": f"{self.risk:g}",
         }  # fmt: skip
         if likely is not None:
             values["cause"] = likely.cause

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats
 from gpusense.backends import Selection
-from gpusense.localization.pose_algebra import compose_poses, pose_difference
+from gpusense.localization.pose_algebra import compose_poses
 from gpusense.logs import Scan
 from gpusense.matching.match import Method, match_scan
 from gpusense.matching.result import ScanMatch
@@ -57,6 +57,13 @@ def differences(poses: Floats, others: Floats) -> tuple[Floats, Floats]:
     return np.hypot(off[:, 0], off[:, 1]), np.abs(wrapped(off[:, 2]))
 
 
+def relative_poses(first: Floats, second: Floats) -> Floats:
+    """Return (S, 3) second poses in the frames of first ones; NaN where one is unknown."""
+    c, s, off = np.cos(first[:, 2]), np.sin(first[:, 2]), second - first
+    turn = wrapped(off[:, 2])
+    return np.stack([c * off[:, 0] + s * off[:, 1], -s * off[:, 0] + c * off[:, 1], turn], axis=1)
+
+
 def match_log(
     scans: list[tuple[int, Scan]],
     grid: OccupancyGrid | None,
@@ -84,9 +91,9 @@ def match_log(
     scanner = scans[0][1].scanner
     if grid is None:
         odometry = np.array([scan.odometry for _, scan in scans])
-        logged = pose_difference(poses[:-1], poses[1:])
+        logged = relative_poses(poses[:-1], poses[1:])
         guesses = {
-            "odometry": pose_difference(odometry[:-1], odometry[1:]),
+            "odometry": relative_poses(odometry[:-1], odometry[1:]),
             "logged": logged,
             "identity": 0 * odometry[1:],
         }

@@ -41,6 +41,21 @@ def test_scans_are_matched_to_the_ones_before(capsys, log, tmp_path):
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_log_without_poses_is_matched_from_odometry(capsys, tmp_path):
+    """A Wean Hall log has odometry and no poses."""
+    lines = []
+    for k in range(3):
+        x, y, theta = pose = (0.2 * k - 1.0, 0.0, 0.1 * k)
+        ranges = " ".join(f"{100 * r:.1f}" for r in np.minimum(segments_scan(ROOM, pose, SCANNER), 81.83))
+        place = f"{100 * x:.3f} {100 * y:.3f} {theta:.5f}"
+        lines.append(f"L {place} {place} {ranges} {k}.0")
+    log = tmp_path / "wean.log"
+    log.write_text("\n".join(lines) + "\n")
+    document = json.loads(run(capsys, "--log", log, "--json", "--guess", "odometry"))
+    assert document["summary"]["statuses"] == {"converged": 2}
+    assert document["summary"]["position_median"] is None and document["summary"]["correction_position_median"] < 0.02
+
+
 def test_the_document_has_all_matches(capsys, log):
     document = json.loads(run(capsys, "--log", log, "--json", "--every", 2, "--shift", 0.1, "--turn", 3))
     assert [(row["reference"], row["scan"]) for row in document["matches"]] == [(0, 2), (2, 4), (4, 6)]

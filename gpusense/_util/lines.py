@@ -120,8 +120,8 @@ def until_cut(
     """Yield the records that ``read`` yields from the numbered lines of a file; it raises ValueError at a bad line.
 
     A last line without a line break that breaks the format was truncated by a killed recorder or an interrupted copy.
-    It is skipped with a warning, unless it is the first record. ``skip``: Whether to skip other bad lines too, if they
-    are fewer than the records, with one warning; ``read`` is called again for the lines after each of them.
+    It is skipped with a warning, unless it is the first record. ``skip``: Whether one warning also
+    replaces the errors of other bad lines, if these are fewer than the records; ``read`` is called again after each.
     """
     last, ended, records, bad = (0, b"\n"), False, 0, 0
     first: ValueError | None = None

@@ -70,7 +70,7 @@ class Storage:
 
 
 def _topic(kind: str, name: str, encoding: str) -> Topic:
-    """Return a topic; the type of one with an unknown encoding ends with it, so that no reader takes the topic."""
+    """Return a topic; an unknown encoding is appended to its type, so that no reader takes the topic."""
     if encoding == "ros1":
         package, _, last = kind.rpartition("/")
         kind = f"{package.split('/')[0]}/msg/{last}"
@@ -211,8 +211,9 @@ class _Chunked(Storage):
             data = stream.read(chunk.length)
         try:
             yield from self._parse(_decompressed(data, chunk))
-        except ImportError:
+        except (ImportError, MemoryError):
             raise
+        # Each decompressor has errors of its own; ``broken`` reports them.
         except Exception as error:
             if chunk.whole:
                 self.broken[chunk.place] = error

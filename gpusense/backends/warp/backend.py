@@ -147,7 +147,7 @@ class WarpBackend(ProcessBound, Backend):
         return adopted(array, self._device, name)
 
     def ahead(self, array: object) -> Hashable:
-        """See Backend.ahead; the memory serves the current stream, and other libraries have their own ones."""
+        """See Backend.ahead; memory is bound to the current stream, and other libraries use streams unknown here."""
         return (wp.array, self._device.stream if self._device.is_cuda else None) if type(array) is wp.array else None
 
     def empty_like(self, array: Any, shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, wp.array] | None:

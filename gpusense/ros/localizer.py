@@ -186,12 +186,21 @@ class Localizer:
             "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
             "radius": f"{found.protection_level(self.risk):.3f}", "risk": f"{self.risk:g}",
         }  # fmt: skip
-        # The search for a cause takes milliseconds: do it once per estimate.
         if found.verdict != "tracking" and self._cause is None:
-            run = diagnose_run(self.filter.models, self._history, search=False)
-            self._cause = (run if run.cause in CAUSES_OF_RUNS else self.filter.diagnose()).text
+            self._cause = self._likely_cause()
         text = ": ".join(filter(None, (found.verdict, self._cause)))
         return status_fields("filter", LEVELS[found.verdict], text, values, node)
+
+    def _likely_cause(self) -> str:
+        """Return the likely cause by the last scan and, with kernels, by the motion between the scans of the run.
+
+        The reference would match those scans for seconds.
+        """
+        if self.filter.models[0].device.selection != "numpy":
+            run = diagnose_run(self.filter.models, self._history, search=False)
+            if run.cause in CAUSES_OF_RUNS:
+                return run.text
+        return str(self.filter.diagnose().text)
 
     def _readings(self, fields: Mapping[str, Any], scanner: Scanner) -> np.ndarray:
         """Return the readings for the filter's scanner, as in logs; make the filter if it is missing.
@@ -233,10 +242,12 @@ class Localizer:
 
 MOST = 500
 """Most waiting scans."""
+# Most time that counts as waiting between two looks [s]: a longer one was spent on other work.
+_LONGEST = 0.5
 
 
 class ScanQueue:
-    """Queue of scans that wait for their transforms, at most ``patience`` seconds without the delivery of others.
+    """Queue of scans that wait for their transforms, at most ``patience`` seconds in which the node was idle.
 
     A scan beyond ``most`` drops the oldest. ``dropped`` counts these, and ``reason`` explains the last.
     """
@@ -255,7 +266,7 @@ class ScanQueue:
         self.dropped = 0
         self.reason: str | None = None
         self._waiting: deque[tuple[float, float, Any]] = deque()
-        self._busy = 0.0
+        self._looked, self._waited = clock(), 0.0
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -266,7 +277,8 @@ class ScanQueue:
         for each in later:
             self._waiting.remove(each)
             self._drop("the stamps of scans went back")
-        self._waiting.append((self._idle(), stamp, scan))
+        self._count()
+        self._waiting.append((self._waited, stamp, scan))
         self.check()
         while len(self._waiting) > self.most:
             self._waiting.popleft()
@@ -278,13 +290,14 @@ class ScanQueue:
         Transforms arrive in the order of time. Scans before a ready one are older than every known transform, and
         never become ready. After a scan that must wait, all others must wait.
         """
+        self._count()
         position = 0
         while position < len(self._waiting):
             since, _, scan = self._waiting[position]
             try:
                 transforms = self._look_up(scan)
             except TransformError as error:
-                if self._idle() - since > self.patience:
+                if self._waited - since > self.patience:
                     del self._waiting[position]
                     self._drop(f"no transform within {self.patience:g} s: {error}")
                 elif error.early:
@@ -297,16 +310,17 @@ class ScanQueue:
                 self._drop("the transforms begin after the scan")
             self._waiting.popleft()
             position = 0
-            begin = self._clock()
             self._deliver(scan, transforms)
-            self._busy += self._clock() - begin
+            self._looked = self._clock()
 
     def clear(self) -> None:
         """Drop all waiting scans, for a deactivated node."""
         self._waiting.clear()
 
-    def _idle(self) -> float:
-        return self._clock() - self._busy
+    def _count(self) -> None:
+        """Count the time since the last look as waiting."""
+        now = self._clock()
+        self._waited, self._looked = self._waited + min(now - self._looked, _LONGEST), now
 
     def _drop(self, reason: str) -> None:
         self.dropped, self.reason = self.dropped + 1, reason

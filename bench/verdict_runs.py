@@ -17,7 +17,7 @@ from common import command_line, part_of
 import gpusense as gs
 from gpusense._util.progress import progress
 from gpusense.evaluation.log_steps import read_steps
-from gpusense.localization.pose_algebra import compose_poses
+from gpusense.world.pose_algebra import compose_poses
 
 # Names of the logs in the data folder; intel-rawodom is a part of intel, and the lasers of jarvis are one log.
 LOGS = (

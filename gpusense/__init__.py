@@ -41,7 +41,7 @@ _NAMES = {
     "localization.monitor": ("PoseMonitor", "PoseVerdict"),
     "localization.motion": ("OdometryMotion", "OmniMotion", "VelocityMotion", "odometry_turns"),
     "localization.motion_fit": ("MotionFit", "fit_odometry_motion"),
-    "localization.pose_algebra": ("compose_poses", "invert_poses", "mean_pose", "pose_difference", "wrap_angle"),
+    "world.pose_algebra": ("compose_poses", "invert_poses", "mean_pose", "pose_difference", "wrap_angle"),
     "localization.state": ("FilterState",),
     "localization.temperature": ("calibrate_temperature",),
     "localization.weights": ("Weights", "normalize_weights", "resample"),

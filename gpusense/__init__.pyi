@@ -46,11 +46,6 @@ from gpusense.localization.motion import VelocityMotion as VelocityMotion
 from gpusense.localization.motion import odometry_turns as odometry_turns
 from gpusense.localization.motion_fit import MotionFit as MotionFit
 from gpusense.localization.motion_fit import fit_odometry_motion as fit_odometry_motion
-from gpusense.localization.pose_algebra import compose_poses as compose_poses
-from gpusense.localization.pose_algebra import invert_poses as invert_poses
-from gpusense.localization.pose_algebra import mean_pose as mean_pose
-from gpusense.localization.pose_algebra import pose_difference as pose_difference
-from gpusense.localization.pose_algebra import wrap_angle as wrap_angle
 from gpusense.localization.state import FilterState as FilterState
 from gpusense.localization.temperature import calibrate_temperature as calibrate_temperature
 from gpusense.localization.weights import Weights as Weights
@@ -101,6 +96,11 @@ from gpusense.world.parameters import IncidenceParameters as IncidenceParameters
 from gpusense.world.parameters import LandmarkParameters as LandmarkParameters
 from gpusense.world.parameters import LikelihoodFieldParameters as LikelihoodFieldParameters
 from gpusense.world.plausible import PlausibilityWarning as PlausibilityWarning
+from gpusense.world.pose_algebra import compose_poses as compose_poses
+from gpusense.world.pose_algebra import invert_poses as invert_poses
+from gpusense.world.pose_algebra import mean_pose as mean_pose
+from gpusense.world.pose_algebra import pose_difference as pose_difference
+from gpusense.world.pose_algebra import wrap_angle as wrap_angle
 from gpusense.world.scanner import Reading as Reading
 from gpusense.world.scanner import Scanner as Scanner
 from gpusense.world.scanner import classify as classify

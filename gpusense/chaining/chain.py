@@ -37,9 +37,9 @@ from gpusense.chaining.matcher import (
 from gpusense.chaining.place_recognition import place_points_of
 from gpusense.chaining.result import ScanChain, doubts_of
 from gpusense.localization.motion import OdometryMotion
-from gpusense.localization.pose_algebra import compose_poses, pose_difference
 from gpusense.matching.match import readings
 from gpusense.models.arguments import real_dtype
+from gpusense.world.pose_algebra import compose_poses, pose_difference, rotations
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_scans import check_scans
 
@@ -277,8 +277,7 @@ class Chainer:
             start = self._odometry[0]
             moved = pose_difference(self._odometry[nodes[node]], self._odometry[:count])
             poses = compose_poses(poses, moved)
-        c, s = np.cos(start[2]), np.sin(start[2])
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = rotations(start[2])
         durations = tuple(self._durations)
         return ScanChain(
             compose_poses(start, poses), turn @ covariance @ turn.T, solution.links.renumbered(nodes),

@@ -20,7 +20,7 @@ from gpusense.chaining.graph import KERNEL, Equations, Solution, solve
 from gpusense.chaining.links import CLOSURE, Links, relative
 from gpusense.chaining.matcher import BATCH, TeamMatcher
 from gpusense.chaining.place_recognition import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing, overlaps
-from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.world.pose_algebra import wrap_angle
 
 # Windows of searches [m, rad], with the least cell size of places [m] and the most candidates for each.
 _LEVELS = (

@@ -28,8 +28,8 @@ from gpusense.chaining.matcher import (
     motions_around,
     weakened,
 )
-from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
+from gpusense.world.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.world.scanner import Scanner
 
 # Motion between key scans [m, rad].

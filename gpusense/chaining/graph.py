@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.links import Links, chained
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.world.pose_algebra import pose_difference, wrap_angle
 
 # Columns per panel, fewer than SuperLU's default, since few columns of a pose graph are alike.
 _PANEL = 4

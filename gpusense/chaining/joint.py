@@ -32,7 +32,7 @@ from gpusense.chaining.links import (
 )
 from gpusense.chaining.matcher import SURE
 from gpusense.localization.motion import OdometryMotion
-from gpusense.localization.pose_algebra import pose_difference
+from gpusense.world.pose_algebra import pose_difference
 
 TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have repeating errors that no single match reveals."""

@@ -13,8 +13,8 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats, Integers
 from gpusense.localization.motion import OdometryMotion, turns_between
 from gpusense.localization.motion_fit import fit_odometry_motion
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.world.deskew import part_of_arc
+from gpusense.world.pose_algebra import pose_difference, wrap_angle
 
 MATCH, ODOMETRY, MOTION, COUPLING, CLOSURE = "match", "odometry", "motion", "coupling", "closure"
 KINDS = {

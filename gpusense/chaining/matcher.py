@@ -21,11 +21,11 @@ from gpusense._util.typing import Flags, Floats, Integers, Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.chaining.links import Links, chained, relative, scan_motions
 from gpusense.localization.motion import OdometryMotion
-from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
 from gpusense.matching.icp_with_search import is_held
 from gpusense.matching.match import WINDOW, match_log, match_scan
 from gpusense.matching.points import scan_noise
 from gpusense.matching.result import ScanMatch
+from gpusense.world.pose_algebra import compose_poses, invert_poses, rotations, wrap_angle
 from gpusense.world.scanner import Scanner
 
 # Least time gap of a jump, in usual steps and [s].
@@ -161,8 +161,7 @@ class Matcher:
         c, s = np.cos(match.pose[:, 2]), np.sin(match.pose[:, 2])
         inner = np.tile(np.eye(3), (len(pose), 1, 1))
         inner[:, 0, 2], inner[:, 1, 2] = -s * back[0] - c * back[1], c * back[0] - s * back[1]
-        c, s = np.cos(one[2]), np.sin(one[2])
-        inverse = np.linalg.inv(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ inner)
+        inverse = np.linalg.inv(rotations(one[2]) @ inner)
         information = inverse.transpose(0, 2, 1) @ match.information @ inverse
         return match.changed(pose=pose, information=information)
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.links import Links, relative
-from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
 from gpusense.matching.points import scan_points
+from gpusense.world.pose_algebra import compose_poses, invert_poses, wrap_angle
 from gpusense.world.sensor_scans import SensorScans
 
 # Least share of common cells of a scan.

@@ -18,10 +18,10 @@ from gpusense.learning.landmark.fit import fit_landmark_parameters
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.motion import OdometryMotion, SampledMotion
 from gpusense.localization.motion_fit import fit_odometry_motion
-from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.logs.records import LandmarkRun, Pose, Scan
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.world.parameters import LandmarkParameters
+from gpusense.world.pose_algebra import wrap_angle
 from gpusense.world.scanner import Scanner
 
 ALPHA: tuple[float, ...] = (0.09, 0.01, 0.04, 0.0004)

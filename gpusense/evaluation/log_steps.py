@@ -14,11 +14,11 @@ import numpy as np
 from gpusense._util.notices import warn_user
 from gpusense._util.typing import Floats
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at, read_tum
-from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
 from gpusense.logs.reader import LogOptions, format_of, read_lasers
 from gpusense.logs.records import check_scanner
 from gpusense.logs.ros import PoseTrack, read_poses
+from gpusense.world.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.world.scanner import Scanner
 
 # Logged poses count as copied odometry if no step differs by more than this [m, rad].

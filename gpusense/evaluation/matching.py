@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats
 from gpusense.backends import Selection
-from gpusense.localization.pose_algebra import compose_poses
 from gpusense.logs import Scan
 from gpusense.matching.match import Method, match_scan
 from gpusense.matching.result import ScanMatch
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.pose_algebra import compose_poses
 
 # Matches per call; a run can be interrupted between calls, and keeps the results so far.
 _BATCH = 50

@@ -22,7 +22,6 @@ from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.beam_consistency import BeamConsistency, MapJudge
 from gpusense.localization.belief import Belief, evidence_of_scan
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
-from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.spread import LOST, TRACKING, Word
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.weights import normalize_weights
@@ -31,6 +30,7 @@ from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.classed import choose_beams
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.pose_algebra import mean_pose
 from gpusense.world.scanner import Reading, classify
 from gpusense.world.sensor_parameters import SensorTable
 

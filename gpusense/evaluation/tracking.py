@@ -14,8 +14,8 @@ from gpusense._util.typing import Floats
 from gpusense.evaluation.log_steps import Step, repeats_odometry
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.localization.spread import WORDS, Word
+from gpusense.world.pose_algebra import pose_difference, wrap_angle
 
 # Largest errors of the next scans of a converged track [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5

@@ -15,8 +15,8 @@ from gpusense._util import checks
 from gpusense._util.files import write_whole
 from gpusense._util.lines import until_cut
 from gpusense._util.typing import Floats
-from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.logs import Pose
+from gpusense.world.pose_algebra import wrap_angle
 
 # Largest time between two poses of a trajectory that are interpolated, and between equal times [s].
 _FARTHEST, _SAME_TIME = 0.5, 1e-3

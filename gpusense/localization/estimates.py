@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpusense._util.html import card, pose_rows
-from gpusense.localization.pose_algebra import mean_pose, wrap_angle
 from gpusense.localization.spread import LEAST_SAMPLE, Distances, JudgedPose, Word
+from gpusense.world.pose_algebra import mean_pose, wrap_angle
 
 # Bins of positions and headings [m, rad]; neighbouring bins belong to one cluster.
 _BIN, _BIN_TURN = 0.5, 0.35

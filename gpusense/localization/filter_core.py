@@ -18,13 +18,13 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
-from gpusense.localization.pose_algebra import compose_poses, wrap_angle
 from gpusense.localization.rival import Recovery
 from gpusense.localization.sensors import Sensor, SensorReadings, grid_of, readings_of
 from gpusense.localization.spread import Distances, margins_of, share_off, share_off_of, spread_of, verdict_label
 from gpusense.localization.state import Options
 from gpusense.localization.tracker import Tracker, is_together
 from gpusense.localization.verdict import Verdict
+from gpusense.world.pose_algebra import compose_poses, wrap_angle
 
 # Number of evaluated particles; largest share of skipped beams.
 _ASKED, _MOST_SKIPPED = 100, 0.7

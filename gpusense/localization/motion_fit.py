@@ -28,7 +28,7 @@ from gpusense._util.html import card
 from gpusense._util.typing import AnyArray
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import SHORTEST, OdometryMotion, turns_between
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.world.pose_algebra import pose_difference, rotated, wrap_angle
 
 _FREEDOM = 4.0
 _LEAST_ALPHA, _MOST_ALPHA = 1e-6, 1.0
@@ -326,15 +326,15 @@ def errors_of(turns: np.ndarray, references: np.ndarray, at: np.ndarray) -> Erro
     turn = np.where(np.hypot(moved[:, 0], moved[:, 1]) < SHORTEST, 0.0, np.arctan2(moved[:, 1], moved[:, 0]))
     turn = np.where(np.abs(turn) > np.pi / 2, turn - np.copysign(np.pi, turn), turn)
     difference = truth - moved
-    residual = np.column_stack([_turned(difference[:, :2], -turn), wrap_angle(difference[:, 2])])
+    residual = np.column_stack([rotated(difference[:, :2], -turn), wrap_angle(difference[:, 2])])
     steps = slice(at[0], at[-1])
     gap = np.repeat(np.arange(len(moved)), np.diff(at))
     axis = (path[at[:-1], 2] + turn)[gap]
     # Line from the end of a step to the end of its gap: a turn displaces the gap's end at right angles.
-    lever = _turned((path[at[1:]][gap] - path[1:][steps])[:, :2], -axis)
+    lever = rotated((path[at[1:]][gap] - path[1:][steps])[:, :2], -axis)
     carry = np.zeros((len(gap), 3, 3))
-    carry[:, :2, 0] = _turned(np.tile((1.0, 0.0), (len(gap), 1)), way[steps] - axis)
-    carry[:, :2, 1] = _turned(np.tile((0.0, 1.0), (len(gap), 1)), way[steps] - axis)
+    carry[:, :2, 0] = rotated(np.array([1.0, 0.0]), way[steps] - axis)
+    carry[:, :2, 1] = rotated(np.array([0.0, 1.0]), way[steps] - axis)
     carry[:, 0, 2], carry[:, 1, 2], carry[:, 2, 2] = -lever[:, 1], lever[:, 0], 1.0
     basis, design = _of_steps(turns[steps])
     first_steps = at[:-1] - at[0]
@@ -343,13 +343,6 @@ def errors_of(turns: np.ndarray, references: np.ndarray, at: np.ndarray) -> Erro
         np.add.reduceat(carry @ basis @ carry.transpose(0, 2, 1), first_steps, axis=1),
         np.add.reduceat(carry @ design, first_steps, axis=0),
     )
-
-
-def _turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return (N, 2) vectors turned by (N,) angles."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    x, y = vectors.T
-    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
 
 
 def _of_steps(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,6 @@ import numpy as np
 from gpusense.backends import arrays
 from gpusense.localization import starts
 from gpusense.localization.belief import ratio_of_places, ratio_of_scan
-from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.sensors import Sensor, SensorReadings
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings
@@ -26,6 +25,7 @@ from gpusense.matching.locate import likely_poses
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.pose_algebra import wrap_angle
 from gpusense.world.scanner import classify_ranges, float64_readings
 
 # Candidates of each search on a map; effective number of initial candidates of a rival; beams of a scan in a search.

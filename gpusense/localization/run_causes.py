@@ -21,12 +21,12 @@ from gpusense._util.typing import Floats
 from gpusense.localization.beam_consistency import counts_of
 from gpusense.localization.belief import motion_between, ratio_of_scan
 from gpusense.localization.diagnosis import Diagnosis, evidence_of, explains
-from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.localization.rival_search import SPREAD_OF_POSE, RivalSearch
 from gpusense.localization.scan_motion import Moment, ScanMotion, Window, mirrored_motion, scan_motion
 from gpusense.localization.sensors import Sensor, sensors_of
 from gpusense.localization.spread import FAR, FAR_TURN
 from gpusense.localization.verdict import sightings
+from gpusense.world.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.world.scanner import float64_readings
 
 CAUSES_OF_RUNS = ("odometry", "time", "mount", "scale", "moved")

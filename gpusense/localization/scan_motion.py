@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
 from gpusense.localization.belief import motion_between
-from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.match import match_scan
+from gpusense.world.pose_algebra import compose_poses, interpolated, invert_poses, pose_difference, wrap_angle
 from gpusense.world.scanner import Scanner, float64_readings
 
 # Most windows, and scans of one. Scans of a window are this far apart [m, rad], or that many scans.
@@ -208,11 +208,9 @@ class _Compared:
 
     def delayed(self, delay: float) -> Floats:
         """Return the motions of the odometry at other times."""
-        at = [
-            np.stack([np.interp(self.times[index] + delay, self.times, self.odometry[:, k]) for k in range(3)], axis=1)
-            for index in (self.first, self.second)
-        ]
-        return pose_difference(*at)
+        return pose_difference(*(
+            interpolated(self.times[index] + delay, self.times, self.odometry) for index in (self.first, self.second)
+        ))  # fmt: skip
 
 
 def _judged(compared: _Compared, scanner: Scanner) -> ScanMotion:

@@ -18,8 +18,8 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.interface import constants
-from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.sensors import Sensor
+from gpusense.world.pose_algebra import wrap_angle
 
 Word = Literal["tracking", "uncertain", "lost"]
 WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")

@@ -31,6 +31,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.matching.columns import axes_of_one
 from gpusense.models.scan.model import ScanModel
+from gpusense.world.pose_algebra import rotations
 
 # Independent beams of a scan before any data.
 INDEPENDENT_AT_FIRST = 10.0
@@ -284,9 +285,7 @@ class BeamCorrelation:
 def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, pose: AnyArray) -> None:
     """Add a scan (K,) at a (3,) pose; this scan and the present temperature determine the covariance."""
     at, count = checks.array("pose", pose, (3,)), model.used_beams
-    sine, cosine = np.sin(at[2]), np.cos(at[2])
-    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    first = np.array(_FIRST_STEPS)
+    turn, first = rotations(at[2]), np.array(_FIRST_STEPS)
     parts = _parts(model, poses_around(at, turn * first), ranges)
     parts = np.where(np.isfinite(parts).all(axis=0), parts, 0.0)
     curvature = np.maximum((2 * parts[0] - parts[1:4] - parts[4:7]).sum(axis=1), 0.0) / (_FAR * first) ** 2

@@ -30,6 +30,7 @@ from gpusense._util.lines import numbers_in, until_cut
 from gpusense._util.typing import Floats, Integers
 from gpusense.logs.records import LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
+from gpusense.world.pose_algebra import interpolated
 
 # Indices of subjects that are no landmarks: a robot, and the owner of an unlisted barcode.
 _ROBOT, _UNKNOWN = -1, -2
@@ -104,8 +105,7 @@ def dead_reckoning(velocities: Floats) -> Floats:
 
 def _at(time: Floats, track: Floats) -> Floats:
     """Interpolate (T, 4) times and poses to (S, 3) poses at (S,) times."""
-    columns = (track[:, 1], track[:, 2], np.unwrap(track[:, 3]))
-    return np.stack([np.interp(time, track[:, 0], column) for column in columns], axis=1)
+    return interpolated(time, track[:, 0], np.column_stack([track[:, 1:3], np.unwrap(track[:, 3])]))
 
 
 def _file(path: Path) -> Path:

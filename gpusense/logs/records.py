@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats, Integers
+from gpusense.world.frames import ray_vectors
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.messages import tilt_of
+from gpusense.world.pose_algebra import rotated
 from gpusense.world.scanner import Scanner
 
 Pose = tuple[float, float, float]
@@ -219,7 +221,5 @@ def _end_points(scan: Scan, turn: float) -> Floats:
     scanner = scan.scanner
     hit = np.isfinite(scan.ranges) & (scan.ranges > max(scanner.range_min, 0.05)) & (scan.ranges < scanner.range_max)
     x, y, theta = scanner.mount
-    angle = scanner.bearings[hit] + theta + turn
-    on_robot = np.stack([x + scan.ranges[hit] * np.cos(angle), y + scan.ranges[hit] * np.sin(angle)])
-    c, s = math.cos(scan.odometry[2]), math.sin(scan.odometry[2])
-    return (np.array([[c, -s], [s, c]]) @ on_robot).T + scan.odometry[:2]
+    on_robot = scan.ranges[hit, None] * ray_vectors(scanner.bearings[hit], (x, y, theta + turn)) + (x, y)
+    return rotated(on_robot, scan.odometry[2]) + scan.odometry[:2]

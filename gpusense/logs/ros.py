@@ -61,6 +61,7 @@ from gpusense.logs.records import Odometry, Pose, Scan, planar, planar_mount
 from gpusense.logs.transform_buffer import TransformError
 from gpusense.world.messages import LEVEL, planar_covariance, planar_part, stamp_of, tilt_of
 from gpusense.world.messages import field as field_of
+from gpusense.world.pose_algebra import interpolated
 from gpusense.world.scanner import Scanner
 
 # Mounts that differ by more than this contradict each other [m, rad].
@@ -219,7 +220,7 @@ def _pose_at(time: float, times: Floats, poses: Floats) -> Pose:
     """Interpolate a pose at a time; return (0, 0, 0) without poses."""
     if not len(times):
         return 0.0, 0.0, 0.0
-    x, y, theta = (float(np.interp(time, times, column)) for column in poses.T)
+    x, y, theta = interpolated(time, times, poses).tolist()
     return x, y, math.remainder(theta, 2 * math.pi)
 
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from gpusense._util.lines import numbers_in, until_cut
 from gpusense._util.typing import Floats
-from gpusense.localization.pose_algebra import pose_difference
 from gpusense.logs.records import Odometry, Pose, Scan
+from gpusense.world.pose_algebra import pose_difference
 from gpusense.world.scanner import Scanner
 
 _BEAMS, _RANGE_MAX = 180, 81.83

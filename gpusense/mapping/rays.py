@@ -15,6 +15,7 @@ from gpusense.interface.launches import launch
 from gpusense.world.deskew import beam_poses
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import FARTHEST_ORIGIN, GridFrame
+from gpusense.world.pose_algebra import rotated
 from gpusense.world.scanner import Reading, Scanner, classify
 from gpusense.world.windows import LONGEST_SIDE, Window
 
@@ -43,13 +44,10 @@ class RayEnds:
         length = np.where(hit, scans, range_limit)[used]
         scan, beam = np.nonzero(used)
         poses = poses[scan] if motion is None else _poses_of_beams(poses, motion, scanner.count)[scan, beam]
-        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        x, y, _ = scanner.mount
-        along, across = ray_vectors(scanner.bearings, scanner.mount)[beam].T
-        turned = np.stack([cos * along - sin * across, sin * along + cos * across], axis=1)
+        vectors = ray_vectors(scanner.bearings, scanner.mount)[beam]
         with np.errstate(over="ignore", invalid="ignore"):
-            self.start = poses[:, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
-            self.end = self.start + length[:, None] * turned
+            self.start = poses[:, :2] + rotated(np.array([scanner.mount[:2]]), poses[:, 2])
+            self.end = self.start + length[:, None] * rotated(vectors, poses[:, 2])
         self.hit, self.scan = hit[used], scan
 
     @classmethod

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from gpusense._util.angles import wrapped
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
 from gpusense.interface.constants import TOP
@@ -32,7 +31,6 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.model import ScanModel
 from gpusense.tables.distances import distance_transform
 from gpusense.world.field_density import FieldDensity
-from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import classify_ranges
 
@@ -98,7 +96,8 @@ class FieldSearch:
         )  # fmt: skip
         # Scans may be anywhere: a table of a part of the map would be made again and again.
         rows, cols = model.grid.shape
-        self._corners = to_world(model.grid, np.array([(0, 0, 0), (cols, 0, 0), (0, rows, 0), (cols, rows, 0)], float))
+        corners = np.array([(0, 0, 0), (cols, 0, 0), (0, rows, 0), (cols, rows, 0)], float)
+        self._corners = model.grid._poses_to_world(corners)
         model.prepare(self._corners)
         self._options: Any = dict(backend=backend, unknown=unknown, outside=outside)
 
@@ -182,7 +181,7 @@ class FieldSearch:
             headings = np.broadcast_to(searched.headings, (scans, turns))
             grid = PoseGrid(searched.start.repeat(scans, axis=0), headings, searched.height, searched.width)
         found = self._search.find(cells, grid, slack=np.maximum(hits, most), allowed=allowed)
-        poses, first = to_world(self.grid, grid.poses(found, self.stride)), found.best
+        poses, first = self.grid._poses_to_world(grid.poses(found, self.stride)), found.best
         # Rounding moves a score by half a step for each hit. Modes need the other poses too, mostly few.
         near = found.score >= (found.score[first] - hits)[found.scan]
         every = np.bincount(found.scan)
@@ -216,7 +215,7 @@ class FieldSearch:
 
         everything = slice(0, searched.headings.shape[1])
         first = run(everything, -1)
-        poses = to_world(self.grid, searched.poses(first, self.stride))
+        poses = self.grid._poses_to_world(searched.poses(first, self.stride))
         known = self._steps(model, ranges, len(cells), poses).max() - 1 - _ROUNDING * len(cells)
         # The modes may score less, but only the likeliest pose must not be missed.
         parts = [(everything, run(everything, max(int(known) - most, 0)))]
@@ -231,7 +230,7 @@ class FieldSearch:
         row, col, heading = found
         (x, y), stride = searched.start[0], self.stride
         local = np.stack([x + stride * col, y + stride * row, searched.headings[0, heading]], axis=1)
-        poses = to_world(self.grid, local)
+        poses = self.grid._poses_to_world(local)
         score = self._steps(model, ranges, len(cells), poses)
         order = np.lexsort((heading, col, row, -score))
         order = order[score[order] >= score.max() - most]
@@ -313,10 +312,3 @@ def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
     if search is None:
         search = kept[stride] = FieldSearch(model, stride)
     return search
-
-
-def to_world(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
-    """Convert (M, 3) poses in the grid's frame [cells, cells, rad] to the world, headings from -pi to pi."""
-    xy = grid._to_world(cells[:, :2] * grid.resolution)
-    theta = wrapped(cells[:, 2] + grid.origin[2])
-    return np.column_stack([xy, theta])

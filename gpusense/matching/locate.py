@@ -23,6 +23,7 @@ from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.world_map import check_one_map
+from gpusense.world.pose_algebra import sensor_poses
 from gpusense.world.scanner import Reading, classify, float64_readings
 
 # Modes are searched down to this share of the largest score below the best pose.
@@ -215,9 +216,7 @@ def _mode_numbers(
     if np.isnan(log_p).any():
         rows = padded_rows(first, np.bincount(scan))
         log_p[rows] = log_likelihoods_of(model, poses, rows, ranges)
-    x, y, yaw = model.scanner.mount
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    sensors = poses + np.array([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)]).T
+    sensors = sensor_poses(poses, model.scanner.mount)
     # A number of poses that other calls repeat.
     padded = padded_rows(np.zeros(1, np.intp), np.array([len(scan)]))[0]
     off = ranges[scan] - caster.cast(sensors[padded], model.scanner.bearings)[: len(scan)]

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense._util.angles import wrapped
 from gpusense._util.html import card
 from gpusense._util.typing import Floats
 from gpusense.backends import Backend, Selection, get_backend
@@ -23,6 +22,7 @@ from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import Found, PoseGrid, Search
 from gpusense.tables.distances import distance_transform
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.pose_algebra import rotated
 
 # Occupied and free cells of the local map that the search sums; the correlation takes all.
 _OCCUPIED, _FREE = 400, 200
@@ -305,8 +305,6 @@ def _correlation(state: np.ndarray, occupied: np.ndarray) -> tuple[float, float]
 
 def _to_world(local: _Local, grid: OccupancyGrid, poses: np.ndarray) -> Floats:
     """Return poses of the local map's frame in the world, from poses of its middle in the global map's cells."""
-    theta = poses[:, 2] + grid.origin[2]
-    cos, sin = np.cos(theta), np.sin(theta)
-    x, y = local.middle
-    shift = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
-    return np.column_stack([grid._to_world(poses[:, :2] * grid.resolution) - shift, wrapped(theta)])
+    placed = grid._poses_to_world(poses)
+    placed[:, :2] -= rotated(local.middle[None], poses[:, 2] + grid.origin[2])
+    return placed

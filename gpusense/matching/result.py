@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.angles import wrapped
 from gpusense._util.html import card, pose_rows
 from gpusense._util.typing import Floats
 from gpusense.matching.observability import covariance_of
+from gpusense.world.pose_algebra import compose_poses, rotations
 
 STATUSES = {
     "converged": "the scans agree, and every direction of the pose is observed",
@@ -138,12 +138,7 @@ class ScanMatch:
 
         ``reach`` is the farthest distance [m] and angle [rad] from a guess, see ``covariance_of``.
         """
-        c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
-        x, y, theta = self.pose.T
-        turn = wrapped(theta + frame[:, 2])
-        pose = np.stack([frame[:, 0] + c * x - s * y, frame[:, 1] + s * x + c * y, turn], axis=1)
-        zero, one = np.zeros(len(c)), np.ones(len(c))
-        turned = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+        pose, turned = compose_poses(frame, self.pose), rotations(frame[:, 2])
         information = turned @ self.information @ turned.transpose(0, 2, 1)
         directions = self.directions @ turned.transpose(0, 2, 1)
         covariance = covariance_of(information, self.lever, reach)

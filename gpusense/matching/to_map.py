@@ -32,6 +32,7 @@ from gpusense.tables.distances import distance_transform
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.pose_algebra import rotations, sensor_poses
 from gpusense.world.scanner import Scanner, classify_ranges
 
 # Weight of readings unrelated to the map.
@@ -113,18 +114,16 @@ class MapMatcher:
 
     def _behind_surfaces(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return whether end points lie behind the surfaces of occupied cells, as in maps drawn from end points."""
-        off = ranges - self._caster.cast(self._sensors(pose), self._scanner.bearings)
+        off = ranges - self._cast(pose, self._scanner)
         near = self._hits(ranges) & (np.abs(off) < max(0.3 * self._options.capture, 3 * self._grid.resolution))
         with np.errstate(invalid="ignore"):
             typical = np.array([np.median(row[use]) if use.any() else 0.0 for row, use in zip(off, near, strict=True)])
         behind: np.ndarray = typical > _BEHIND * self._grid.resolution
         return behind
 
-    def _sensors(self, pose: np.ndarray) -> np.ndarray:
-        """Return the poses of the sensor."""
-        x, y, yaw = self._scanner.mount
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        return pose + np.stack([c * x - s * y, s * x + c * y, np.full(len(pose), yaw)], axis=1)
+    def _cast(self, pose: np.ndarray, scanner: Scanner) -> np.ndarray:
+        """Return the expected readings of a scanner at poses of the robot."""
+        return self._caster.cast(sensor_poses(pose, scanner.mount), scanner.bearings)
 
     def _to_expected(self, ranges: np.ndarray, pose: np.ndarray, method: str) -> ScanMatch:
         """Match readings to the expected readings at poses."""
@@ -140,7 +139,7 @@ class MapMatcher:
         rows = np.flatnonzero(found.usable & (found.eigenvalues == 0).any(axis=1))
         if not len(rows) or self._dense is not self._scanner:
             return found
-        expected = self._caster.cast(self._sensors(pose[rows]), self._scanner.bearings).astype(np.float64)
+        expected = self._cast(pose[rows], self._scanner).astype(np.float64)
         held = is_held(
             expected, ranges[rows], self._scanner, found.ordered(rows), self._backend,
             self._real.name,  # type: ignore[arg-type]
@@ -156,7 +155,7 @@ class MapMatcher:
     def _expected_points(self, ranges: np.ndarray, pose: np.ndarray) -> tuple[ScanPoints, np.ndarray]:
         """Return the points of the expected scans at poses and of the readings, and their pairs."""
         dense, scanner = self._dense, self._scanner
-        expected = self._caster.cast(self._sensors(pose), dense.bearings)
+        expected = self._cast(pose, dense)
         numbers = np.arange(2 * len(pose)).reshape(2, -1).T
         if dense is scanner:
             points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), scanner, self._real)
@@ -199,9 +198,7 @@ class MapMatcher:
         within = np.hypot(offset[:, None], offset) <= reach * (1 + 1e-9)
         found = self._search.find(points, poses, allowed=within)
         best = poses.poses(found, stride)[found.best]
-        return np.column_stack(
-            [grid._to_world(best[:, :2] * grid.resolution), wrapped(best[:, 2] + grid.origin[2])]
-        )  # fmt: skip
+        return grid._poses_to_world(best)
 
     def _nearness(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return (S, K) values of ``exp(-d^2 / (2 sigma^2))``, 0 where there is no hit."""
@@ -285,9 +282,9 @@ def observable_directions(
 
 def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     """Return (S, 3, 3) derivatives that convert information on sensors' poses to that on robots' poses in the world."""
-    c, s, (x, y) = np.cos(heading), np.sin(heading), mount
-    zero, one = np.zeros(len(c)), np.ones(len(c))
-    return np.stack([c, -s, zero, s, c, zero, zero - y, zero + x, one], axis=1).reshape(-1, 3, 3)
+    turned = rotations(heading)
+    turned[:, 2, :2] = -mount[1], mount[0]
+    return turned
 
 
 def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

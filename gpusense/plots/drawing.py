@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.files import write_whole
-from gpusense.localization.pose_algebra import compose_poses
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.pose_algebra import compose_poses
 from gpusense.world.scanner import Reading, Scanner, classify
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
-from gpusense.localization.pose_algebra import compose_poses, invert_poses
 from gpusense.localization.spread import check_risk
 from gpusense.logs.records import Pose, planar_mount, pose_fields
 from gpusense.world.messages import field, planar_covariance, planar_pose
+from gpusense.world.pose_algebra import compose_poses, invert_poses
 from gpusense.world.scanner import Scanner
 
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.world.frames import ray_vectors
+from gpusense.world.pose_algebra import rotated
 from gpusense.world.scanner import Scanner, classify_ranges, float64_readings
 
 # Neighbouring readings belong to one surface if their ranges differ by less than this share of a range plus this
@@ -68,9 +69,7 @@ def sensor_points(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
     mount = np.array(scanner.mount[:2])
     with np.errstate(invalid="ignore"):
         point = ranges[..., None] * ray_vectors(scanner.bearings, scanner.mount) + mount
-        c, s = np.cos(heading), np.sin(heading)
-        turned = np.stack([c * point[..., 0] - s * point[..., 1], s * point[..., 0] + c * point[..., 1]], axis=-1)
-        result: Floats = turned + place - mount
+        result: Floats = rotated(point, heading) + place - mount
     return result
 
 

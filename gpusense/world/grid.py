@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense._util.html import card, grey_png
 from gpusense.world.messages import field, planar_pose, real_field
 from gpusense.world.plausible import look_at_grid
@@ -294,6 +295,11 @@ class OccupancyGrid:
     def _to_world(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (M, 2) points in the grid's frame to the world [m]."""
         return self._frame.to_world(local)
+
+    def _poses_to_world(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert (M, 3) poses in the grid's frame [cells, cells, rad] to the world, headings in [-pi, pi)."""
+        xy = self._to_world(local[:, :2] * self.resolution)
+        return np.column_stack([xy, wrapped(local[:, 2] + self.origin[2])])
 
     def _key(self) -> tuple[Any, ...]:
         return self.shape, self._frame, self._occupied_threshold

@@ -12,7 +12,7 @@ from gpusense.chaining.closing import joined_breaks
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.chaining.matcher import SURE, ChainOptions, Matcher
 from gpusense.chaining.place_recognition import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
-from gpusense.localization.pose_algebra import compose_poses, pose_difference
+from gpusense.world.pose_algebra import compose_poses, pose_difference
 
 FRONT = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=181, range_max=12.0)
 MOVED = np.array([0.6, 0.1, 0.3])

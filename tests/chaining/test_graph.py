@@ -10,7 +10,7 @@ import pytest
 from gpusense.chaining.drift import Drift, inverse_blocks, pose_covariances
 from gpusense.chaining.graph import KERNEL, Equations, normal_equations, pose_jacobians, solve
 from gpusense.chaining.links import CLOSURE, MATCH, Links, chained
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.world.pose_algebra import pose_difference, wrap_angle
 
 
 def scene(seed: int, count: int = 12, outlier: bool = False) -> tuple[np.ndarray, Links]:

@@ -21,7 +21,6 @@ from gpusense.evaluation.simulation.crowd import Crowd
 from gpusense.evaluation.simulation.roads import Roads, drive
 from gpusense.evaluation.worlds import is_free, sample_readings
 from gpusense.localization.motion import OdometryMotion, OmniMotion
-from gpusense.localization.pose_algebra import compose_poses
 from gpusense.logs.bag_writer import write_bag
 from gpusense.logs.carmen import write_carmen
 from gpusense.logs.records import Scan
@@ -29,6 +28,7 @@ from gpusense.models.arguments import check_absent
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.pose_algebra import compose_poses
 from gpusense.world.scanner import Scanner
 
 Rng = np.random.Generator

@@ -29,13 +29,13 @@ from gpusense.learning.fitted import (
     scatter_of,
     shortened,
 )
+from gpusense.world.pose_algebra import rotated
 
 
 def places_of(poses: Floats, mount: object) -> Floats:
     """Return the (S, 2) positions in the world of a point (x, y) on the robot at (S, 3) poses."""
-    x, y = checks.array("mount", mount, (2,), largest=checks.FARTHEST)
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    return poses[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
+    place = checks.array("mount", mount, (2,), largest=checks.FARTHEST)
+    return poses[:, :2] + rotated(place[None], poses[:, 2])
 
 
 # Step of differences as a share of a coordinate's scale; the relative error is about its square.

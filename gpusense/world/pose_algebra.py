@@ -1,6 +1,9 @@
-"""Poses (x, y, theta) as rigid motions of the plane: products, inverses, differences and means."""
+"""Poses (x, y, theta) as rigid motions of the plane: products, inverses, differences, means, and rotations."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -126,6 +129,34 @@ def mean_pose(poses: AnyArray, weights: AnyArray | None = None) -> np.ndarray:
     w = w / w.sum()
     heading = np.arctan2(w @ np.sin(values[:, 2]), w @ np.cos(values[:, 2]))
     return np.array([w @ values[:, 0], w @ values[:, 1], heading])
+
+
+def rotated(vectors: Any, angle: Any) -> np.ndarray:
+    """Return (..., 2) vectors turned by angles [rad] that broadcast with them; not checked."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+
+
+def rotations(angle: Any) -> np.ndarray:
+    """Return (..., 3, 3) matrices that turn the positions of poses by angles (...) [rad] and keep headings."""
+    result = np.zeros((*np.shape(angle), 3, 3))
+    result[..., 0, 0] = result[..., 1, 1] = np.cos(angle)
+    result[..., 1, 0] = np.sin(angle)
+    result[..., 0, 1] = -result[..., 1, 0]
+    result[..., 2, 2] = 1.0
+    return result
+
+
+def sensor_poses(poses: np.ndarray, mount: Sequence[float]) -> np.ndarray:
+    """Return the (N, 3) poses of a sensor with a mount (x, y, yaw) on a robot at (N, 3) poses; not checked."""
+    offset = rotated(np.array([mount[:2]]), poses[:, 2])
+    return poses + np.column_stack([offset, np.full(len(poses), mount[2])])
+
+
+def interpolated(time: Any, times: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Return (..., 3) poses at times (...) by linear interpolation of (T, 3) poses with headings without jumps."""
+    return np.stack([np.interp(time, times, column) for column in poses.T], axis=-1)
 
 
 def _poses(name: str, poses: object) -> np.ndarray:

@@ -5,24 +5,26 @@
 #define WORK_RAYS 16
 
 #if WORLDS
-// Particles that fetch a table together, and bytes of a line of the caches.
+// Particles that fetch a table together.
 #define FETCHERS 16
-#define CACHE_LINE 64
 
-// Fetch a part of the table of the world in which the next FETCHERS particles begin, so that it arrives while this
+// Return a part of the table of the world in which the next FETCHERS particles begin, so that it arrives while this
 // world's rays are cast. Particles that change worlds one by one, or cast few rays in large worlds, fetch nothing.
-void fetch_next_world(global const entry *tables, global const int2 *world, const int n, const int particles,
-                      const int begin, const int rays) {
+Lines lines_ahead(global const entry *tables, global const int2 *world, const int n, const int particles,
+                  const int begin, const int rays) {
     const int next = (n | (FETCHERS - 1)) + 1, items = FETCHERS * ((rays + WORK_RAYS - 1) / WORK_RAYS);
+    Lines ahead = {0, 0};
     if (next + 1 >= particles || world[2 * next].x == world[2 * n].x || world[2 * next].x != world[2 * next + 2].x)
-        return;
+        return ahead;
     const Window seen = world_window(world, next);
-    const long lines = (long)PLANES * (seen.rows + 2) * (seen.cols + 2) * sizeof(entry) / CACHE_LINE;
-    if (lines > 2 * FETCHERS * rays) return;
+    const long rows = (seen.rows + 2 + GROUP - 1) / GROUP * GROUP;
+    const long lines = PLANES * rows * (seen.cols + 2) * sizeof(entry) / CACHE_LINE;
+    if (lines > 2 * FETCHERS * rays) return ahead;
     const long item = (n % FETCHERS) * (items / FETCHERS) + begin / WORK_RAYS;
     const size_t table = (size_t)(tables + world_begin(world, next, PLANES));
-    for (long line = lines * item / items; line < lines * (item + 1) / items; ++line)
-        __builtin_prefetch((const void *)(table + line * CACHE_LINE), 0, 2);
+    ahead.next = table + lines * item / items * CACHE_LINE;
+    ahead.end = table + lines * (item + 1) / items * CACHE_LINE;
+    return ahead;
 }
 #endif
 
@@ -32,7 +34,7 @@ kernel void cast_ranges(ARGUMENTS) {
     if (n >= particles) return;
 #if WORLDS
     const Window seen = world_window(world, n);
-    fetch_next_world(map_table, world, n, particles, begin, rays);
+    Lines ahead = lines_ahead(map_table, world, n, particles, begin, rays);
     map_table += world_begin(world, n, PLANES);
 #else
     const Window seen = window;
@@ -48,7 +50,11 @@ kernel void cast_ranges(ARGUMENTS) {
 #else
         const lanes limit = scale.limit;
 #endif
+#if WORLDS
+        const lanes t = walk_and_fetch_lanes(map_table, seen, pose_cell[n], pose[n], x, y, limit, caster, &ahead);
+#else
         const lanes t = cast_ray_lanes(map_table, seen, pose_cell[n], pose[n], x, y, limit, caster);
+#endif
         const lanes range = range_lanes(t, scale);
         if (first + LANES <= rays) {
             store_lanes(range, 0, out);
@@ -57,4 +63,7 @@ kernel void cast_ranges(ARGUMENTS) {
             for (int i = 0; first + i < rays; ++i) out[i] = single[i];
         }
     }
+#if WORLDS
+    fetch_lines(&ahead, INT_MAX);
+#endif
 }

@@ -1,10 +1,35 @@
 // Expected range z* of LANES rays of one pose at once: the walk of raycast.cl in every lane, with the same bits.
 // requires: raycast lanes/rays lanes/each_ray
 
+#if WORLDS
+// Bytes of a line of the caches, and lines that are fetched with each step of a walk.
+#define CACHE_LINE 64
+#define STEP_LINES 4
+
+// Lines of the caches to be fetched, from one address to another.
+typedef struct {
+    size_t next, end;
+} Lines;
+
+// Fetch some of the lines.
+void fetch_lines(Lines *ahead, const int most) {
+    for (int i = 0; i < most && ahead->next < ahead->end; ++i, ahead->next += CACHE_LINE)
+        __builtin_prefetch((const void *)ahead->next, 0, 2);
+}
+
+// The walk has a further argument in worlds: lines ahead, fetched a few with each step. Many at once would keep the
+// walk's own reads waiting.
+#define WALK_LANES walk_and_fetch_lanes
+#define LINES_AHEAD , Lines *ahead
+#else
+#define WALK_LANES cast_ray_lanes
+#define LINES_AHEAD
+#endif
+
 // Return the distances in cells to the first occupied cells along LANES rays of one pose, limits where none is nearer.
 // A lane that has ended reads 0, the first cell of the table's ring.
-lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
-                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster) {
+lanes WALK_LANES(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
+                 const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster LINES_AHEAD) {
 #if ORIGINS_OUTSIDE
     if (off_grid(cell.x, cell.y, window.rows, window.cols))
         return cast_each_ray(map_table, window, cell, pose, ray_x, ray_y, limit, caster);
@@ -42,6 +67,9 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
         const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
 #endif
         const ilanes sides = GATHER(ilanes, map_table, at);
+#if WORLDS
+        fetch_lines(ahead, STEP_LINES);
+#endif
         const ilanes stopped = going & (sides <= OCCUPIED);
         if (any_lane(stopped)) {
 #if OUTSIDE_OCCUPIED
@@ -63,3 +91,12 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
         k_y = by_x ? aside : end_y;
     }
 }
+
+#if WORLDS
+// Return the distances of the walk, without lines ahead.
+lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
+                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster) {
+    Lines none = {0, 0};
+    return walk_and_fetch_lanes(map_table, window, cell, pose, ray_x, ray_y, limit, caster, &none);
+}
+#endif

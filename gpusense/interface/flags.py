@@ -24,7 +24,7 @@ FLAGS = {
     "STOPS": "a ray ends behind its reading, where an obstacle no longer changes the density",
     "SECTORS_2": "empty rectangles are made for 2 sectors of each quadrant's directions",
     "SECTORS_4": "empty rectangles are made for 4 of them",
-    "ROW_GROUPS": "planes of empty rectangles have groups of 8 rows, as those of large maps on GPUs",
+    "ROW_GROUPS": "planes of empty rectangles have groups of 8 rows: large maps on GPUs, many worlds on processors",
     **casters.FLAGS,
     "AMCL_LINES": "Bresenham's lines are nav2_amcl's: they look one cell beyond their end, at ranges beyond range_max",
     "BELUGA_LINES": "Bresenham's lines are Beluga's: ties go straight on, and rays from outside the grid meet nothing",

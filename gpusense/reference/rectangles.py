@@ -116,29 +116,31 @@ def _quadrants(
 
 
 def rectangles_rows(
-    flags, runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds,
+    flags, runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines,
+    group,
 ):  # fmt: skip
     """Find the widest rectangles of sufficient height along rows, from free cells in columns."""
     if worlds > 1:
-        lines = runs[: 2 * band * worlds * cols].reshape(2 * band, worlds, cols)
+        rows_of = runs[: 2 * band * worlds * cols].reshape(2 * band, worlds, cols)
         for w in range(worlds):
             rectangles_rows(
-                flags, lines[:, w].reshape(-1), place[w:], stack, rectangles, rows, cols, sectors, first, band, top,
-                left, bottom, right, 1,
+                flags, rows_of[:, w].reshape(-1), place[w:], stack, rectangles, rows, cols, sectors, first, band, top,
+                left, bottom, right, 1, lines, group,
             )  # fmt: skip
         return
     free = runs[: 2 * band * cols].reshape(2, band, cols)
     rectangles = rectangles[4 * sectors * int(place[0]) :]
-    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
+    planes = rectangles[: 4 * sectors * lines * (cols + 2)].reshape(4, sectors, lines * (cols + 2))
     for quadrant, (dx, _), (row, col) in _quadrants(rows, cols, top, left, bottom, right):
-        reached_part = planes[quadrant, :, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
+        line, column = np.ogrid[row, col]
+        cells = padded_in_groups(line, column, cols, group)
         seen = reached(dx, col, cols)
         run = free[quadrant >> 1, row.start - first : row.stop - first, seen][:, ::dx]
         part = slice(col.start - seen.start, col.stop - seen.start)
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             wide, high = longest(run, width, height)[:, :, ::dx]
-            reached_part[sector] = np.maximum(wide + 256 * high, OCCUPIED)[:, part]
+            planes[quadrant, sector, cells] = np.maximum(wide + 256 * high, OCCUPIED)[:, part]
 
 
 def free_rows(flags, bits, runs, band, cols, words, begin, end):

@@ -40,7 +40,7 @@ class Planes:
     """Storage layout of empty rectangles."""
 
     sectors: int  # sectors per quadrant: 1, 2 or 4. More sectors make steps longer and tables larger.
-    group: int = 1  # rows of a group: 1, or ``ROWS`` on GPUs
+    group: int = 1  # rows of a group: 1 or ``ROWS``
 
     def __post_init__(self) -> None:
         if self.group not in (1, ROWS):
@@ -86,8 +86,6 @@ def empty_rectangles(
     changed: Window | None = None,
 ) -> Buffer:
     """Compute or refresh the padded planes of empty rectangles; the kernel file ``rectangles`` defines them."""
-    if planes.group > 1 and backend.info.kind == "cpu":
-        raise ValueError(f"planes: must have single rows on a processor, got groups of {planes.group}")
     rows, cols = obstacles.shape
     check_size(rows, cols)
     if rectangles is None or changed is None:
@@ -113,11 +111,14 @@ def rectangles_of_worlds(worlds: Worlds, unknown: str) -> tuple[Table, frozenset
     backend = worlds.backend
     rows, cols = worlds.shape
     chosen = planes_of(backend, rows, cols, worlds.cells)
-    # Each of several worlds is read into the caches anew, so smaller tables are faster.
-    sectors = chosen.sectors if len(worlds) == 1 else min(chosen.sectors, 1 if backend.info.kind == "cpu" else 2)
+    sectors, group = chosen.sectors, chosen.group
+    if len(worlds) > 1:
+        # Each of several worlds is read into the caches anew, so smaller tables are faster, and on processors also
+        # planes of which rays read fewer lines of the caches.
+        sectors, group = (1, ROWS) if backend.info.kind == "cpu" else (min(sectors, 2), group)
     while sectors > 1 and 8 * sectors * worlds.cells > worlds.largest_table:
         sectors //= 2
-    planes = Planes(sectors, chosen.group)
+    planes = Planes(sectors, group)
 
     def fill(stack: Stack, table: Buffer) -> None:
         marked, _ = worlds.marked(stack, unknown)
@@ -160,7 +161,8 @@ def _make(
         columns_kernel((strips, 2), marked, runs, band, cols * worlds, first, last)
         stack = space.empty("stack", _STACK * height * worlds, _INT)
         rows_kernel = backend.compile("rectangles_rows", _NO_FLAGS)
-        rows_kernel((height, 4 * worlds), runs, place, stack, rectangles, *changed_part, worlds)
+        layout = (planes.lines(rows), planes.group)
+        rows_kernel((height, 4 * worlds), runs, place, stack, rectangles, *changed_part, worlds, *layout)
         return
     words, lines = -(-cols // 32), band * worlds
     quads = -(-(end - begin) // 4)

@@ -63,7 +63,7 @@ kernel void rectangles_rows(ARGUMENTS) {
     for (int sector = 0; sector < sectors; ++sector) {
         const int2 middle = slope(sectors, sector);
         global ushort *out = rectangles + (long)place[w] * 4 * sectors +
-                             (long)(quadrant * sectors + sector) * (rows + 2) * (cols + 2);
+                             (long)(quadrant * sectors + sector) * lines * (cols + 2);
         int oldest = 0, newest = 0, width = 0;
         for (int i = 0; i < scanned; ++i) {
             const int col = dx > 0 ? begin + scanned - 1 - i : end - scanned + i, here = run[col];
@@ -82,7 +82,7 @@ kernel void rectangles_rows(ARGUMENTS) {
             const int wider = lower * middle.y > width * middle.x;
             if (col < begin || col >= end) continue;
             const int sides = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : OCCUPIED;
-            out[padded(row, col, cols)] = (ushort)sides;
+            out[padded_in_groups(row, col, cols, group)] = (ushort)sides;
         }
     }
 }

@@ -95,7 +95,7 @@ def free_columns(occupied, runs, band, cols, begin, end):
 
 @kernel
 def rectangles_rows(
-    runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds
+    runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group
 ):  # fmt: skip
     """Find the rectangles along rows, from the far end of a row to its begin."""
     way, item = wp.tid()
@@ -114,7 +114,7 @@ def rectangles_rows(
     scanned = wp.where(dx > 0, wp.min(end + RECTANGLE_REACH, cols) - begin, end - wp.max(begin - RECTANGLE_REACH, 0))
     for sector in range(sectors):
         middle = slope(sectors, sector)
-        out = (quadrant * sectors + sector) * (rows + 2) * (cols + 2)
+        out = (quadrant * sectors + sector) * lines * (cols + 2)
         oldest = int(0)
         newest = int(0)
         width = int(0)
@@ -145,7 +145,7 @@ def rectangles_rows(
                 sides = wp.where(width > 0, width + 256 * height, OCCUPIED)
                 if lower * middle[1] > width * middle[0]:
                     sides = width + 1 + 256 * lower
-                planes[out + padded(row, col, cols)] = wp.uint16(sides)
+                planes[out + padded_in_groups(row, col, cols, group)] = wp.uint16(sides)
 
 
 @kernel

@@ -156,8 +156,7 @@ def test_rectangles_have_the_bits_of_the_reference(
         check_empty(occupied, expected)
         np.testing.assert_array_equal(made(as_kind(kind), occupied, form), expected)
         np.testing.assert_array_equal(score(expected), score(planes_of(occupied, form, "cpu")))
-    if kind == "gpu":
-        groups = made(as_kind(kind), occupied, GROUPED)
-        np.testing.assert_array_equal(groups, planes_of(occupied, GROUPED, kind))
-        in_rows = planes_of(occupied, Planes(GROUPED.sectors), kind)
-        np.testing.assert_array_equal(row_after_row(groups, GROUPED, len(occupied)), in_rows)
+    groups = made(as_kind(kind), occupied, GROUPED)
+    np.testing.assert_array_equal(groups, planes_of(occupied, GROUPED, kind))
+    in_rows = planes_of(occupied, Planes(GROUPED.sectors), kind)
+    np.testing.assert_array_equal(row_after_row(groups, GROUPED, len(occupied)), in_rows)

@@ -22,7 +22,7 @@ from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
 from gpusense.tables.casters import Bresenham, Caster, CasterInput, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
-from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
+from gpusense.tables.rectangles import Planes, planes_of
 
 DOCS = ROOT / "docs" / "speed.md"
 KINDS = [
@@ -220,5 +220,3 @@ def test_planes_fit_indices_buffers_and_caches(kind, side, buffer, form):
 def test_planes_that_no_kernel_makes_or_reads_are_refused():
     with pytest.raises(ValueError, match="group: must be 1 or 8, got 4"):
         Planes(2, 4)
-    with pytest.raises(ValueError, match="planes: must have single rows on a processor, got groups of 8"):
-        empty_rectangles(get_backend("numpy"), np.zeros((3, 4), bool), Planes(2, 8))

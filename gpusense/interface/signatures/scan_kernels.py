@@ -36,7 +36,7 @@ _RESULT = ("out real log_p [particles]", "out real parts [particles * readings] 
 _SCORE = ("Score score", _BATCH)
 _FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
 _MAP = ("int rows", "int cols")
-_PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
+_PLANES = "out ushort rectangles [4 * sectors * lines * (cols + 2)]"
 _CHANGED = (
     *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right", "int worlds",
 )  # fmt: skip
@@ -153,7 +153,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "rectangles_rows": kernel(
         "rectangles", "row quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
-        "out int stack [1024 * rows * worlds]", f"out {_PLANES}", *_CHANGED, group=1,
+        "out int stack [1024 * rows * worlds]", _PLANES, *_CHANGED, "int lines", "int group", group=1,
     ),
     "free_rows": kernel(
         "rectangles", "col row", "int bits [band * words]", "out uchar runs [2 * band * cols]", "int band", "int cols",
@@ -161,8 +161,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "rectangles_scan": kernel(
         "rectangles", "col tile quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
-        "out ushort rectangles [4 * sectors * lines * (cols + 2)]", *_CHANGED, "int lines", "int group",
-        "int tall",
+        _PLANES, *_CHANGED, "int lines", "int group", "int tall",
     ),
     "fill_lookup": kernel(
         "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",

@@ -14,7 +14,7 @@ _NEVER: dict[str, frozenset[str]] = {
     "cast_ranges": frozenset(),
     "e_step": _SCALAR - {"FLOAT64"},
     "score_beams": frozenset(),
-    "score_field": frozenset({"ALL_READINGS", "WORLDS"}),
+    "score_field": frozenset({"ALL_READINGS", "SHAPES"}),
     "score_features": _SCALAR | {"LINE"},
 }
 _NEEDED: dict[str, tuple[set[str], ...]] = dict.fromkeys((

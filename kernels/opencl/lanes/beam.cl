@@ -86,8 +86,10 @@ kernel void score_beams(ARGUMENTS) {
 #else
     const int count = size;
 #endif
+    Lines ahead = {0, 0};
 #if WORLDS
     const Window seen = world_window(world, n);
+    ahead = next_table(map_table, world, n, particles, 0, 1, size * cone.rays);
     map_table += world_begin(world, n, PLANES);
     normals += world_begin(world, n, 1);
 #else
@@ -110,7 +112,7 @@ kernel void score_beams(ARGUMENTS) {
             for (; returns.cast <= r; returns.cast += LANES) {
                 const EchoLanes new = nearest_echo_lanes(map_table, normals, seen, pose_cell[n], pose[n], ray,
                                                          returns.cast, size, cone, scale.limit, caster, shapes, world,
-                                                         crowd, n);
+                                                         crowd, n, &ahead);
                 store_lanes(new.t, (returns.cast / LANES) % 2, returns.t);
                 store_lanes(new.cosine, (returns.cast / LANES) % 2, returns.cosine);
             }
@@ -123,7 +125,7 @@ kernel void score_beams(ARGUMENTS) {
 #else
             const lanes limit = ray_limit_lanes(load_some(reading + k, count - k), terms, scale);
             echo[v] = nearest_echo_lanes(map_table, normals, seen, pose_cell[n], pose[n], ray, k, size, cone, limit,
-                                         caster, shapes, world, crowd, n);
+                                         caster, shapes, world, crowd, n, &ahead);
 #endif
         }
         DensityParts parts_of[VECTORS];

@@ -4,7 +4,7 @@
 
 // Return the distances in cells to the first obstacles of the lines, limits where none is nearer.
 lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
-                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster) {
+                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster, Lines *ahead) {
     const int lines = map_table[0];
     global const entry *bin_first = map_table + 1, *first = bin_first + 3 * caster.bins;
     global const entry *bits = first + caster.bins * lines + 1;

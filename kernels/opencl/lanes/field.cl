@@ -1,6 +1,6 @@
 // Likelihood field of LANES particles at once: score_field of field.cl.
-// Lanes share a table, so the scalar body scores particles in several of them (WORLDS).
-// requires: lanes/field_term
+// Lanes share a table: in several worlds (WORLDS), neighbours of one world are scored together.
+// requires: lanes/ahead lanes/field_term
 
 // Particles of a work-item, in vectors. They share each block of beams: while a robot is tracked, its end points fall
 // into few cells of the table. There is a work-item for each 16 particles; the first of ITEMS does the work of all of
@@ -8,6 +8,18 @@
 #define TOGETHER 64
 #define ITEMS 4
 #define VECTORS (TOGETHER / LANES)
+
+#if WORLDS
+// Return the lines of the field of the next particle's world; none if it is the same one, see lines_ahead.
+Lines next_field(global const real *tables, global const int2 *world, const int n, const int next, const int particles,
+                 const int reads) {
+    const Lines none = {0, 0};
+    if (next >= particles || world[2 * next].x == world[2 * n].x) return none;
+    const Window seen = world_window(world, next);
+    const long size = (long)(seen.rows + 2 * FIELD_RING) * (seen.cols + 2 * FIELD_RING) * sizeof(real);
+    return lines_ahead((size_t)(tables + world_begin(world, next, 1)), size, 0, 1, reads);
+}
+#endif
 
 // Score scans: one work-item takes TOGETHER particles, and the beams block by block.
 kernel void score_field(ARGUMENTS) {
@@ -28,67 +40,83 @@ kernel void score_field(ARGUMENTS) {
     const real constant_term = score.constant_term;
     if (left <= 0) return;
 #endif
-    const int count = left < TOGETHER ? left : TOGETHER;
-    Particles all[VECTORS];
-    lanes total[VECTORS], total_low[VECTORS];
-    for (int v = 0; v * LANES < count; ++v) {
-        total[v] = constant_term;
-        total_low[v] = 0;
-        for (int i = 0; i < LANES; ++i) {
-            const int lane = v * LANES + i, n = begin + (lane < count ? lane : count - 1);
-            set_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
+    const int end = begin + (left < TOGETHER ? left : TOGETHER);
+    for (int base = begin, count; base < end; base += count) {
+#if WORLDS
+        count = 1;
+        while (base + count < end && world[2 * (base + count)].x == world[2 * base].x) ++count;
+        const Window seen = world_window(world, base);
+        global const real *cells = table + world_begin(world, base, 1);
+        const int steps = (count + LANES - 1) / LANES * all_readings;
+        Lines ahead = next_field(table, world, base, base + count, particles, count * all_readings);
+        const int lines_of_step = (int)((ahead.end - ahead.next) / CACHE_LINE + steps) / (steps + 1);
+#else
+        count = end - base;
+        const Window seen = window;
+        global const real *cells = table;
+#endif
+        Particles all[VECTORS];
+        lanes total[VECTORS], total_low[VECTORS];
+        for (int v = 0; v * LANES < count; ++v) {
+            total[v] = constant_term;
+            total_low[v] = 0;
+            for (int i = 0; i < LANES; ++i) {
+                const int lane = v * LANES + i, n = base + (lane < count ? lane : count - 1);
+                set_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
+            }
         }
-    }
-    for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
-        const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
+        for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
+            const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
 #if TWO_PART_POINTS
 #if !BILINEAR
-        const real margin = place_margin(point + from, size);
+            const real margin = place_margin(point + from, size);
 #endif
 #endif
-        for (int v = 0; v * LANES < count; ++v) {
-            const int first = begin + v * LANES, used = count - v * LANES < LANES ? count - v * LANES : LANES;
-            lanes block = 0;
+            for (int v = 0; v * LANES < count; ++v) {
+                const int first = base + v * LANES, used = count - v * LANES < LANES ? count - v * LANES : LANES;
+                lanes block = 0;
 #if BILINEAR
-            EndPoints ends;
-            LanePair square[BLOCK_TERMS];
-            find_places(&ends, &all[v], point + from, point_low + from, size, window);
-            find_squares(square, &ends, table, terms, size, window);
+                EndPoints ends;
+                LanePair square[BLOCK_TERMS];
+                find_places(&ends, &all[v], point + from, point_low + from, size, seen);
+                find_squares(square, &ends, cells, terms, size, seen);
 #elif FLOAT64
-            EndPoints ends;
-            find_cells(&ends, &all[v], point + from, size, window);
+                EndPoints ends;
+                find_cells(&ends, &all[v], point + from, size, seen);
 #else
-            EndPoints ends;
-            if (find_cells(&ends, &all[v], point + from, size, window, margin))
-                refine_cells(&ends, &all[v], margin, first, used, pose_cell, pose, pose_low, point + from,
-                             point_low + from, size, window, guard);
+                EndPoints ends;
+                if (find_cells(&ends, &all[v], point + from, size, seen, margin))
+                    refine_cells(&ends, &all[v], margin, first, used, pose_cell, pose, pose_low, point + from,
+                                 point_low + from, size, seen, guard);
 #pragma unroll 4
 #endif
-            for (int k = 0; k < size; ++k) {
+                for (int k = 0; k < size; ++k) {
+                fetch_lines(&ahead, lines_of_step);
 #if BILINEAR
-                const lanes term = log_square_lanes(square[k], terms);
+                    const lanes term = log_square_lanes(square[k], terms);
 #else
-                const int *at = (const int *)&ends.cell[k];
-                const lanes term = GATHER_BY_TWO(lanes, table, at);
+                    const int *at = (const int *)&ends.cell[k];
+                    const lanes term = GATHER_BY_TWO(lanes, cells, at);
 #endif
 #if PER_BEAM
-                for (int i = 0; i < used; ++i)
-                    parts[(long)(first + i) * readings + from + k] = ((const real *)&term)[i];
+                    for (int i = 0; i < used; ++i)
+                        parts[(long)(first + i) * readings + from + k] = ((const real *)&term)[i];
 #endif
-                block += term;
+                    block += term;
+                }
+                const lanes sum = total[v] + block, shift = sum - total[v];
+                total_low[v] += (total[v] - (sum - shift)) + (block - shift);
+                total[v] = sum;
             }
-            const lanes sum = total[v] + block, shift = sum - total[v];
-            total_low[v] += (total[v] - (sum - shift)) + (block - shift);
-            total[v] = sum;
         }
-    }
 #if CUBES
-    for (int i = 0; i < count; ++i)
-        log_p[begin + i] = score.temperature * log(((const real *)total)[i] + ((const real *)total_low)[i]);
+        for (int i = 0; i < count; ++i)
+            log_p[base + i] = score.temperature * log(((const real *)total)[i] + ((const real *)total_low)[i]);
 #else
-    for (int v = 0; v * LANES < count; ++v) {
-        const lanes high = total[v], sum = score.temperature * (high + total_low[v]);
-        store_some(high - high == 0 ? sum : high, log_p + begin + v * LANES, count - v * LANES);
-    }
+        for (int v = 0; v * LANES < count; ++v) {
+            const lanes high = total[v], sum = score.temperature * (high + total_low[v]);
+            store_some(high - high == 0 ? sum : high, log_p + base + v * LANES, count - v * LANES);
+        }
 #endif
+    }
 }

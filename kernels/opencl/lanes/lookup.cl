@@ -3,7 +3,7 @@
 
 // Return the distances in cells from the table, limit where no obstacle is nearer; limit is the table's in every lane.
 lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
-                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster) {
+                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster, Lines *ahead) {
 #if ORIGINS_OUTSIDE
     if (off_grid(cell.x, cell.y, window.rows, window.cols))
         return cast_each_ray(map_table, window, cell, pose, ray_x, ray_y, limit, caster);

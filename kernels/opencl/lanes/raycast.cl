@@ -1,35 +1,13 @@
 // Expected range z* of LANES rays of one pose at once: the walk of raycast.cl in every lane, with the same bits.
-// requires: raycast lanes/rays lanes/each_ray
+// requires: raycast lanes/ahead lanes/rays lanes/each_ray
 
-#if WORLDS
-// Bytes of a line of the caches, and lines that are fetched with each step of a walk.
-#define CACHE_LINE 64
+// Lines that a step fetches.
 #define STEP_LINES 4
 
-// Lines of the caches to be fetched, from one address to another.
-typedef struct {
-    size_t next, end;
-} Lines;
-
-// Fetch some of the lines.
-void fetch_lines(Lines *ahead, const int most) {
-    for (int i = 0; i < most && ahead->next < ahead->end; ++i, ahead->next += CACHE_LINE)
-        __builtin_prefetch((const void *)ahead->next, 0, 2);
-}
-
-// The walk has a further argument in worlds: lines ahead, fetched a few with each step. Many at once would keep the
-// walk's own reads waiting.
-#define WALK_LANES walk_and_fetch_lanes
-#define LINES_AHEAD , Lines *ahead
-#else
-#define WALK_LANES cast_ray_lanes
-#define LINES_AHEAD
-#endif
-
 // Return the distances in cells to the first occupied cells along LANES rays of one pose, limits where none is nearer.
-// A lane that has ended reads 0, the first cell of the table's ring.
-lanes WALK_LANES(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
-                 const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster LINES_AHEAD) {
+// A lane that has ended reads 0, the first cell of the table's ring. Each step fetches some lines ahead.
+lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
+                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster, Lines *ahead) {
 #if ORIGINS_OUTSIDE
     if (off_grid(cell.x, cell.y, window.rows, window.cols))
         return cast_each_ray(map_table, window, cell, pose, ray_x, ray_y, limit, caster);
@@ -67,9 +45,7 @@ lanes WALK_LANES(global const entry *map_table, const Window window, const int2 
         const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
 #endif
         const ilanes sides = GATHER(ilanes, map_table, at);
-#if WORLDS
         fetch_lines(ahead, STEP_LINES);
-#endif
         const ilanes stopped = going & (sides <= OCCUPIED);
         if (any_lane(stopped)) {
 #if OUTSIDE_OCCUPIED
@@ -93,10 +69,20 @@ lanes WALK_LANES(global const entry *map_table, const Window window, const int2 
 }
 
 #if WORLDS
-// Return the distances of the walk, without lines ahead.
-lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
-                     const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster) {
-    Lines none = {0, 0};
-    return walk_and_fetch_lanes(map_table, window, cell, pose, ray_x, ray_y, limit, caster, &none);
+// Particles that fetch a table together.
+#define FETCHERS 16
+
+// Return a part, of the parts of a particle, of the table of the world in which the next FETCHERS particles begin.
+// Particles that change worlds one by one, or cast few rays in large worlds, fetch nothing.
+Lines next_table(global const entry *tables, global const int2 *world, const int n, const int particles, const int part,
+                 const int parts, const int rays) {
+    const int next = (n | (FETCHERS - 1)) + 1;
+    const Lines none = {0, 0};
+    if (next + 1 >= particles || world[2 * next].x == world[2 * n].x || world[2 * next].x != world[2 * next + 2].x)
+        return none;
+    const Window seen = world_window(world, next);
+    const long rows = (seen.rows + 2 + GROUP - 1) / GROUP * GROUP, size = PLANES * rows * (seen.cols + 2) * sizeof(entry);
+    const size_t table = (size_t)(tables + world_begin(world, next, PLANES));
+    return lines_ahead(table, size, (n % FETCHERS) * parts + part, FETCHERS * parts, FETCHERS * rays);
 }
 #endif

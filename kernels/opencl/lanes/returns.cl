@@ -1,6 +1,6 @@
 // Nearest returns of LANES cones of one pose at once, and the cosines of their angles of incidence: echo.cl in lanes,
 // with the same bits. A laser's cone is one ray.
-// requires: lanes/caster lanes/rays lanes/shapes
+// requires: lanes/ahead lanes/caster lanes/rays lanes/shapes
 
 // Distances in cells, and cosines of the angles of incidence; without a return limit and 2.
 typedef struct {
@@ -57,7 +57,8 @@ void hit_normal_lanes(global const real2 *normals, const Window window, const in
 EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *normals, const Window window,
                              const int2 cell, const real4 pose, global const real2 *ray, const int first,
                              const int count, const Cone cone, const lanes limit, const Caster caster,
-                             global const real *shapes, global const int2 *world, const Crowd crowd, const int n) {
+                             global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
+                             Lines *ahead) {
     lanes x, y;
 #if CONES
     EchoLanes echo = {limit, 2};
@@ -71,7 +72,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
 #if BRESENHAM
         farthest = limit;
 #endif
-        const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, farthest, caster);
+        const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, farthest, caster, ahead);
 #if SHAPES
         const LanePair shape = nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met);
         const lanes t = shape.x;
@@ -98,7 +99,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
     return echo;
 #else
     load_ray_lanes(ray, first, count, 1, &x, &y);
-    const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, limit, caster);
+    const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, limit, caster, ahead);
 #if SHAPES
     return (EchoLanes){nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met).x, 2};
 #else

@@ -4,15 +4,16 @@
     python bench/speed/worlds.py --backend warp:cuda:0 --worlds 256,1024,4096,8192 --shapes 64 --kernels
 
 Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single room has as many
-robots as the largest number of worlds, up to 4096. Rates time whole calls and, after a slash, bound calls. Poses,
-indices and ranges are in a GPU's memory, for processors in the host's. --kernels adds the time of each launch by the
-device's clock. --peers casts lidars among discs in worlds without walls, and runs VMAS and ir-sim on the same scene
-where they are installed.
+robots as the largest number of worlds, up to 4096. Rates time whole calls and, after a slash, bound calls. Models
+score one scan. Poses, indices and ranges are in a GPU's memory, for processors in the host's. --kernels adds the time
+of each launch by the device's clock. --peers casts lidars among discs in worlds without walls, and runs VMAS and ir-sim
+on the same scene where they are installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 import sys
 import tempfile
@@ -32,7 +33,10 @@ from common import Recorder, add_repeats, make_parser, note, on_device, parse, p
 
 SIDE, ROBOTS, RESOLUTION, RANGE_MAX = 256, 16, 0.05, 10.0
 BEARINGS = np.linspace(-np.pi, np.pi, 360, endpoint=False)
-COLUMNS = "worlds|shapes|M rays/s, whole call / bound call|of one room|made [ms]|replaced [ms]|bytes a cell|launches"
+COLUMNS = (
+    "worlds|shapes|M rays/s, whole call / bound call|of one room|M readings/s, beam model / field|of one room|"
+    "made [ms]|replaced [ms]|bytes a cell|launches"
+)
 
 
 def rooms(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -92,14 +96,28 @@ def shapes_of(worlds: int, count: int, rng: np.random.Generator) -> gs.Shapes:
     return gs.Shapes(discs=discs, boxes=boxes, segments=np.concatenate([begin, begin + 0.5], axis=2))
 
 
-def rate_of_one(backend: Any, worlds: int, repeats: int, seconds: float) -> float:
-    """Return the rate of bound calls for the robots of some worlds in a single room [rays/s]."""
+def scoring_rates(place: Any, poses: Any, where: Any, backend: Any, repeats: int, seconds: float) -> np.ndarray:
+    """Return the rates of a beam model and a field that score one scan at all poses [readings/s]."""
+    scanner = gs.Scanner(BEARINGS, range_max=RANGE_MAX)
+    (scan,), found = there(backend, np.random.default_rng(1).uniform(0.5, 9, len(BEARINGS))), []
+    for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
+        model = kind(place, scanner, backend=backend)
+        options = {} if where is None else {"world": where}
+        call = functools.partial(model.log_likelihood, poses, scan, **options)
+        found.append(len(poses) * len(BEARINGS) / least(call, backend, repeats, seconds))
+    return np.array(found)
+
+
+def rates_of_one(backend: Any, worlds: int, repeats: int, seconds: float) -> np.ndarray:
+    """Return the rates of bound casts, a beam model and a field for the robots of some worlds in one room [1/s]."""
     rng = np.random.default_rng(0)
-    caster = gs.RayCaster(gs.OccupancyGrid(rooms(1, rng)[0], RESOLUTION), RANGE_MAX, backend=backend)
+    room = gs.OccupancyGrid(rooms(1, rng)[0], RESOLUTION)
+    caster = gs.RayCaster(room, RANGE_MAX, backend=backend)
     (poses,) = there(backend, poses_in(worlds, rng))
-    rate = len(poses) * len(BEARINGS) / least(caster.bind(poses, BEARINGS), backend, repeats, seconds)
-    note(f"one room: {rate / 1e6:.0f} M rays/s")
-    return rate
+    cast = len(poses) * len(BEARINGS) / least(caster.bind(poses, BEARINGS), backend, repeats, seconds)
+    rates = np.array([cast, *scoring_rates(room, poses, None, backend, repeats, seconds)])
+    note(f"one room: {', '.join(f'{rate / 1e6:.0f}' for rate in rates)} M rays, readings of a beam model, a field/s")
+    return rates
 
 
 def by_events(device: Any, launches: list[Callable[[], None]]) -> list[tuple[str, float]]:
@@ -154,7 +172,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     backend, rng, rows = get_backend(arguments.backend), np.random.default_rng(0), []
     numbers = [int(number) for number in arguments.worlds.split(",")]
     repeats, seconds, few = arguments.repeats, arguments.seconds, min(max(numbers), 4096)
-    room = rate_of_one(backend, few, repeats, seconds)
+    room = rates_of_one(backend, few, repeats, seconds)
     for count in numbers:
         recorder = Recorder(backend) if arguments.kernels else backend
         kinds = rooms(min(count, 256), rng)
@@ -182,10 +200,11 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             call = caster.bind(poses, BEARINGS, world=where)
             call()
             bound = rays / least(call, backend, repeats, seconds)
+            scored = scoring_rates(worlds, poses, where, backend, repeats, seconds)
             rows.append(dict(
-                worlds=count, shapes=shapes, rate=rate / 1e6, bound=bound / 1e6, of_room=bound / room,
-                made=1e3 * made, replaced=1e3 * replaced,
-                bytes=worlds.nbytes / (count * SIDE * SIDE),
+                worlds=count, shapes=shapes, rate=rate / 1e6, bound=bound / 1e6, of_room=bound / room[0],
+                scored=(scored / 1e6).tolist(), scored_of_room=(scored / room[1:]).tolist(),
+                made=1e3 * made, replaced=1e3 * replaced, bytes=worlds.nbytes / (count * SIDE * SIDE),
                 launches="; ".join(timed(recorder, run) for run in (cast, replace)),
             ))  # fmt: skip
             note(" | ".join(line_of(rows[-1])))
@@ -291,7 +310,8 @@ obstacle:
 
 def line_of(row: dict[str, Any]) -> list[str]:
     """Return the cells of a row."""
-    text = "{worlds}|{shapes}|{rate:.0f} / {bound:.0f}|{of_room:.2f}|{made:.2f}|{replaced:.2f}|{bytes:.1f}|"
+    text = "{worlds}|{shapes}|{rate:.0f} / {bound:.0f}|{of_room:.2f}|{scored[0]:.0f} / {scored[1]:.0f}|"
+    text += "{scored_of_room[0]:.2f} / {scored_of_room[1]:.2f}|{made:.2f}|{replaced:.2f}|{bytes:.1f}|"
     return [*text.format(**row).split("|")[:-1], row["launches"]]
 
 

@@ -76,6 +76,8 @@ class BeamModel(ScanModel):
         1
     """
 
+    _takes_worlds = True
+
     def __init__(
         self,
         grid: OccupancyGrid | Worlds,

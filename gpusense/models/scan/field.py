@@ -64,6 +64,8 @@ class LikelihoodFieldModel(ScanModel):
         1
     """
 
+    _takes_worlds = True
+
     def __init__(
         self,
         grid: OccupancyGrid | Worlds,

@@ -8,7 +8,7 @@ import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, overload
 
 import numpy as np
 
@@ -43,6 +43,7 @@ _MOST_RESIDENT = 16
 class ScanModel(Pickled):
     """Base of the models of whole scans: the beam model and the likelihood field."""
 
+    _takes_worlds: ClassVar[bool] = False  # whether kernels obey the flags WORLDS and SHAPES
     _stages: ScanPipeline  # of a single map
 
     def __init__(
@@ -65,6 +66,8 @@ class ScanModel(Pickled):
         possible: bool,
     ) -> None:
         checks.instance("scanner", scanner, Scanner)
+        if not self._takes_worlds:
+            checks.instance("grid", grid, OccupancyGrid)
         check_scene(grid, scanner.range_max)
         # The worlds; None in a single map.
         self._worlds = grid if isinstance(grid, Worlds) else None

@@ -212,6 +212,10 @@ def test_bad_calls_are_refused(scene: dict[str, Any]) -> None:
         gs.BeamModel(worlds, SCANNER, backend="numpy", compat="amcl")
     with pytest.raises(ValueError, match=r"^grid: must be a single map for update_map, got Worlds"):
         model.update_map([[0]], (0, 0))
+    # A model whose kernels do not know worlds would score all poses in the first one.
+    of_one_map = type("OfOneMap", (gs.LikelihoodFieldModel,), {"_takes_worlds": False})
+    with pytest.raises(TypeError, match=r"^grid: must be an OccupancyGrid, got Worlds"):
+        of_one_map(worlds, SCANNER, backend="numpy")
     single_map = gs.BeamModel(scene["grids"][0], SCANNER, backend="numpy")
     for call in (single_map.log_likelihood, single_map.bind):
         with pytest.raises(ValueError, match=r"^world: must be None for a model of a single map"):

@@ -25,11 +25,12 @@ class Format:
     """A format of logs."""
 
     name: str  # name of the format in messages, with an article
-    module: str  # the module whose function ``read(file, *, range_max, range_min, odometry, rear)`` yields its records
+    module: str  # the module whose function ``read(file, *, range_max, range_min, odometry)`` yields its records
     magic: tuple[bytes, ...] = ()  # first bytes of its binary files; they take precedence over suffixes
     suffixes: tuple[str, ...] = ()  # suffixes of its files without these bytes
     begins: tuple[bytes, ...] = ()  # first bytes of its text files
     topics: bool = False  # whether ``read`` also takes the options of bags
+    rear: bool = False  # whether ``read`` also takes ``rear``
 
 
 BAG2 = Format("a ROS 2 bag", "gpusense.logs.ros", (MCAP, SQLITE, ZSTD), (".db3", ".mcap"), topics=True)
@@ -38,7 +39,7 @@ FORMATS = (
     Format("a ROS 1 bag", "gpusense.logs.ros", (b"#ROSBAG V",), (".bag",), topics=True),
     BAG2,
     Format("a Wean Hall log", "gpusense.logs.wean", begins=(b"L ", b"O ")),
-    Format("a CARMEN log", "gpusense.logs.carmen"),
+    Format("a CARMEN log", "gpusense.logs.carmen", rear=True),
 )
 
 
@@ -137,7 +138,12 @@ def read_log(
     for name, flag in (("odometry", odometry), ("rear", rear)):
         checks.boolean(name, flag)
     form = format_of(file)
-    options: dict[str, object] = dict(range_max=range_max, range_min=range_min, odometry=odometry, rear=rear)
+    options: dict[str, object] = dict(range_max=range_max, range_min=range_min, odometry=odometry)
+    if form.rear:
+        options["rear"] = rear
+    elif rear:
+        lasers = "whose lasers have topics (topic=)" if form.topics else "whose robot has one laser"
+        raise ValueError(f"rear: must be False for {form.name}, {lasers}, got True")
     options |= _ros_options(form, mount, topic=topic, frame=frame, odometry_from=odometry_from)
     records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(file, **options)
     return records
@@ -212,11 +218,13 @@ def _records(
     """Read the records of one laser; None for the laser that ``read_log`` takes."""
     if form.topics:
         return read_log(path, odometry=odometry, topic=name, **options)
-    if name not in (None, FRONT, REAR):
+    if name not in (None, FRONT) and not (form.rear and name == REAR):
         raise _wrong_laser(form, [name])
     return read_log(path, odometry=odometry, rear=name == REAR, **options)
 
 
 def _wrong_laser(form: Format, names: Sequence[object]) -> ValueError:
-    rule = f"must be only one of 'front' and 'rear' for {form.name}, which states no mounts"
+    rule = f"must be left out for {form.name}, whose robot has one laser"
+    if form.rear:
+        rule = f"must be only one of 'front' and 'rear' for {form.name}, which states no mounts"
     return ValueError(f"sensors: {rule}, got {', '.join(map(str, names))}")

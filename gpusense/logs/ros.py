@@ -36,7 +36,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -68,17 +67,11 @@ from gpusense.world.scanner import Scanner
 _APART = (0.02, math.radians(2))
 
 
-def read(path: Path, *, rear: bool, **options: Any) -> Iterator[Scan | Odometry]:
-    """Read the records of a bag; see :func:`gpusense.read_log` for arguments and errors."""
-    if rear:
-        raise ValueError("rear: must be False for a ROS bag, whose lasers have topics (topic=), got True")
-    return _records(path, **options)
-
-
-def _records(
+def read(
     path: Path, *, range_max: float | None, odometry: bool, range_min: float | None, topic: str | None,
     frame: str | None, mount: Pose | None, odometry_from: str | None,
 ) -> Iterator[Scan | Odometry]:  # fmt: skip
+    """Read the records of a bag; see :func:`gpusense.read_log` for arguments and errors."""
     bag = survey(path, topic, frame, odometry_from)
     lasers = _lasers(bag, mount, range_min, range_max)
     times, poses = bag.track.sorted()

@@ -32,12 +32,8 @@ _NAMES = {b"L": 6 + _BEAMS + 1, b"O": 4}
 _MOVED = 0.02
 
 
-def read(
-    path: Path, *, range_max: float | None, range_min: float | None, odometry: bool, rear: bool
-) -> Iterator[Scan | Odometry]:
+def read(path: Path, *, range_max: float | None, range_min: float | None, odometry: bool) -> Iterator[Scan | Odometry]:
     """Read the records of a log; see :func:`gpusense.read_log` for arguments and errors."""
-    if rear:
-        raise ValueError("rear: must be False for a Wean Hall log, whose robot has one laser, got True")
     limits = range_max or _RANGE_MAX, range_min or 0.0
     scanners: list[Scanner] = []
     return until_cut(path, lambda lines: _records(path, lines, limits, odometry, scanners), skip=True)

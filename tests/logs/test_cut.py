@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import struct
 import tracemalloc
 import warnings
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from support import landmark_log
 from support.bags import Writer
+from support.text_logs import LOGS, each_text_format
 
 import gpusense as gs
 from gpusense._util import lines
@@ -74,8 +76,6 @@ def test_a_map_line_with_one_long_field_takes_no_more_memory_than_the_line(tmp_p
         tracemalloc.stop()
 
 
-CARMEN = [f"FLASER 3 1.0 2.5 {3 + i}.0 0 0 0 0 0 0 {i}.5 host {i}.5" for i in range(6)]
-WEAN = [f"L 0 0 0 0 0 0 {' '.join(['100'] * 180)} {i}.5" for i in range(6)]
 TUM = [f"{i}.0 {i}.5 2 0 0 0 0 1" for i in range(6)]
 
 
@@ -83,20 +83,22 @@ def count(path: Path, **options) -> int:
     return len(list(gs.read_log(path, **options)))
 
 
-@pytest.mark.parametrize("lines", [CARMEN, WEAN], ids=["CARMEN", "Wean Hall"])
+@each_text_format
 @pytest.mark.parametrize("packed", [False, True], ids=["plain", "gzip"])
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
-def test_a_log_is_read_up_to_a_cut_in_its_last_line(tmp_path, lines, packed, share):
-    path = tmp_path / ("run.log.gz" if packed else "run.log")
+def test_a_log_is_read_up_to_a_cut_in_its_last_line(tmp_path, form, packed, share):
+    name, lines = LOGS[form.module]
+    path = tmp_path / (f"{name}.gz" if packed else name)
     text = "\n".join(lines[:-1]) + "\n" + lines[-1][: int(len(lines[-1]) * share)]
     path.write_bytes(gzip.compress(text.encode()) if packed else text.encode())
-    with pytest.warns(UserWarning, match=r"run\.log(\.gz)?:6: the file ends in the middle of this line"):
+    with pytest.warns(UserWarning, match=f"{re.escape(path.name)}:6: the file ends in the middle of this line"):
         assert count(path) == 5
 
 
-@pytest.mark.parametrize("lines", [CARMEN, WEAN], ids=["CARMEN", "Wean Hall"])
-def test_a_last_line_without_an_end_is_whole_and_a_few_bad_lines_are_skipped(tmp_path, lines):
-    path = tmp_path / "run.log"
+@each_text_format
+def test_a_last_line_without_an_end_is_whole_and_a_few_bad_lines_are_skipped(tmp_path, form):
+    name, lines = LOGS[form.module]
+    path = tmp_path / name
     path.write_text("\n".join(lines))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -115,11 +117,11 @@ def test_a_last_line_without_an_end_is_whole_and_a_few_bad_lines_are_skipped(tmp
         assert len(told) == len(rules) and all(rule in str(one.message) for rule, one in zip(rules, told, strict=True))
     # Most lines are bad.
     path.write_text("\n".join([lines[0], bad, bad, bad, ""]))
-    with pytest.raises(ValueError, match=r"run\.log:2: "):
+    with pytest.raises(ValueError, match=f"{re.escape(name)}:2: "):
         count(path)
     # The cut line alone.
     path.write_text(lines[0][:30])
-    with pytest.raises(ValueError, match=r"run\.log"):
+    with pytest.raises(ValueError, match=re.escape(name)):
         count(path)
 
 

@@ -196,7 +196,7 @@ LOG_CASES = [
     (log_with(GOOD_LINE, topic="/scan"), V, "topic: must be left out for a CARMEN log, got '/scan'"),
     (log_with(GOOD_LINE, mount=(0, 0, 0)), V, "mount: must be left out for a CARMEN log, got (0, 0, 0)"),
     (log_with("data", name="run.bag", rear=True), V,
-     "rear: must be False for a ROS bag, whose lasers have topics (topic=), got True"),
+     "rear: must be False for a ROS 1 bag, whose lasers have topics (topic=), got True"),
     bad_lines(":2: must begin with L or O, got 'X'", WEAN_LINE, "X 1 2"),
     bad_lines(":2: O: must have 5 fields, got 3", WEAN_LINE, "O 1 2"),
     bad_lines(":1: O: field 2 must be a finite number, got '1_0'", "O 0 1_0 0 1"),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import sys
 from types import ModuleType
 
 import pytest
+from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import BackendInfo, get_backend, listing, registry, selection
@@ -181,3 +183,8 @@ def test_kinds_select_their_fastest_device():
 def test_a_misspelt_name_suggests_the_right_one():
     with pytest.raises(AttributeError, match="no attribute 'BeamModle'; did you mean 'BeamModel'"):
         gs.BeamModle  # noqa: B018
+
+
+def test_the_page_of_drivers_names_every_backend():
+    page = (ROOT / "docs" / "drivers.md").read_text(encoding="utf-8")
+    assert [entry.name for entry in ENTRIES if not re.search(rf"\b{entry.name}:|^{entry.name} ", page, re.M)] == []

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.selection import NO_SELECTION
 
 import gpusense as gs
 from gpusense.tables import casters
@@ -69,9 +70,6 @@ def absent(selection: str) -> Callable[[], str]:
     return message
 
 
-NO_SELECTION = (
-    "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', got {!r}"
-).format
 RULE = "rule: must be one of 'safe', 'centre', got {}".format
 
 V, T = ValueError, TypeError

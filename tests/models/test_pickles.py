@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from support.absolute_scenes import models as absolute_models
+from support.public_names import classes_of
 
 import gpusense as gs
+from gpusense.models.arguments import Pickled
 
 CELLS = np.pad(np.zeros((20, 30), int), 1, constant_values=100)
 GRID = gs.OccupancyGrid(CELLS, 0.1)
@@ -86,6 +88,10 @@ def test_copies_have_the_bits_and_the_options(name, how, backend):
     assert made.backend is model.backend
     # No device memory was copied.
     assert len(pickle.dumps(model)) < 30_000
+
+
+def test_every_model_has_a_case():
+    assert {type(make("numpy")) for make, _ in CASES.values()} == classes_of(Pickled)
 
 
 @pytest.mark.parametrize("name", CASES)

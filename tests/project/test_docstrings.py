@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from support import public_names
+from support.paths import ROOT
 
 import gpusense as gs
 
@@ -93,6 +94,11 @@ def test_a_public_name_has_a_short_example(name: str) -> None:
     lines = text.split("\nExample:\n")[1].splitlines()
     assert lines[0].strip().startswith(">>> import gpusense as gs")
     assert 2 <= sum(line.strip().startswith((">>>", "...")) for line in lines) <= 6
+
+
+def test_pages_name_every_model() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
+    assert [name for name in NAMES if name.endswith("Model") and name not in pages] == []
 
 
 def test_public_methods_have_or_inherit_a_docstring() -> None:

@@ -37,11 +37,13 @@ class Scene(NamedTuple):
     """A model that draws and scores readings, and the poses of a prior.
 
     Attributes:
+        model: The model.
         poses: (N, 3) poses.
         draw: Returns a reading of each of some poses with a seed.
         score: Returns log p of a reading at poses.
     """
 
+    model: Any
     poses: Floats
     draw: Draw
     score: Score
@@ -78,7 +80,7 @@ _FEATURES = LandmarkParameters(
 def _scan(name: str, options: dict[str, Any]) -> Scene:
     scanner, parameters, more = _SCANS[name]
     model = BeamModel(_GRID, scanner, parameters, **more, **options)
-    return Scene(cloud_uniform(_GRID, 8, np.random.default_rng(6)), model.sample, model.log_likelihood)
+    return Scene(model, cloud_uniform(_GRID, 8, np.random.default_rng(6)), model.sample, model.log_likelihood)
 
 
 def _points(low: tuple[float, float, float], high: tuple[float, float, float]) -> Floats:
@@ -88,7 +90,7 @@ def _points(low: tuple[float, float, float], high: tuple[float, float, float]) -
 def _point(model: Any) -> Scene:
     over_map = isinstance(model, BumperModel)
     poses = _points((0.5, 0.5, -3.1), (11.5, 9.5, 3.1)) if over_map else _points((0, 0, -3.1), (5, 5, 3.1))
-    return Scene(poses, model.sample, model.log_likelihood)
+    return Scene(model, poses, model.sample, model.log_likelihood)
 
 
 def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
@@ -106,7 +108,7 @@ def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
     def score(at: Floats, features: np.ndarray) -> np.ndarray:
         return model.log_likelihood(at, features, correspondence=_PARTNERS)
 
-    return Scene(poses, draw, score)
+    return Scene(model, poses, draw, score)
 
 
 def _lines(options: dict[str, Any]) -> Scene:
@@ -122,7 +124,7 @@ def _lines(options: dict[str, Any]) -> Scene:
     def score(at: Floats, features: np.ndarray) -> np.ndarray:
         return model.log_likelihood(at, features, correspondence=partners)
 
-    return Scene(_points((-1.0, 0.0, -3.1), (5.0, 5.0, 3.1)), draw, score)
+    return Scene(model, _points((-1.0, 0.0, -3.1), (5.0, 5.0, 3.1)), draw, score)
 
 
 def _beacons(kind: Any, options: dict[str, Any]) -> Scene:

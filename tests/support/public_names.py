@@ -21,5 +21,11 @@ def stub() -> str:
     return _HEAD + "\n".join(lines) + "\n"
 
 
+def classes_of(base: type) -> set[type]:
+    """Return the public classes that inherit from ``base``."""
+    values = (getattr(gs, name) for name in gs.__all__)
+    return {value for value in values if isinstance(value, type) and issubclass(value, base)}
+
+
 if __name__ == "__main__":
     STUB.write_text(stub(), encoding="utf-8")

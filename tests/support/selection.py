@@ -10,9 +10,14 @@ from collections.abc import Callable, Iterable
 import pytest
 
 from gpusense.backends import get_backend
+from gpusense.backends.registry import ENTRIES
 
 # Backends of tests; with a GPU for example GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
+
+_NAMES = ["auto", *(name for entry in ENTRIES for name in entry.selections)]
+# The error of a selection string that names no device.
+NO_SELECTION = f"backend: must be {', '.join(map(repr, _NAMES[:-1]))} or {_NAMES[-1]!r}, got {{!r}}".format
 
 # Errors of devices without float64.
 NO_FLOAT64 = re.compile(r"which has no float64|computes in float64, which .* does not have")

@@ -17,6 +17,7 @@ from support.raycast_scenes import cast as scene_cast
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.casters import ENTRIES
+from gpusense.interface.kernel_files import has_opencl_source
 from gpusense.interface.structs import RangeScale, Window
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
@@ -129,7 +130,9 @@ def test_beam_model_is_the_mixture_at_the_casters_ranges(kind, backend):
 def rows_of_the_page() -> dict[str, list[str]]:
     """Return the cells of each caster's row in the page's table, by the caster's name."""
     lines = [line.split("|")[1:-1] for line in DOCS.read_text(encoding="utf-8").splitlines() if line.startswith('| `"')]
-    return {cells[0].strip(' `"'): [cell.strip() for cell in cells] for cells in lines}
+    rows = {cells[0].strip(' `"'): [cell.strip() for cell in cells] for cells in lines}
+    assert casters.CASTERS.keys() <= rows.keys(), "docs/speed.md: must have a row of each caster"
+    return rows
 
 
 def value_of(formula: str, **names: int) -> float:
@@ -195,6 +198,10 @@ def test_the_page_of_casters_mentions_every_method_and_knob():
             assert any(f"`{knob.name}`" in cell for cell in rows[name]), (name, knob.name)
     page = DOCS.read_text(encoding="utf-8")
     assert "sensor_table=" in page and "save_table(" in page
+    single = {name for name, entry in ENTRIES.items() if not has_opencl_source(f"lanes/{entry.file}")}
+    assert set(re.findall('`"(.*?)"`', re.findall(r"16 rays at once, except with (.*)\.\n", page)[0])) == single
+    headings = re.findall(r"^### (.*)$", (DOCS.parent / "background" / "speed.md").read_text(encoding="utf-8"), re.M)
+    assert casters.CASTERS.keys() <= set(" ".join(headings).split())
 
 
 @pytest.mark.parametrize(

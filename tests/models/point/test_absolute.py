@@ -21,10 +21,13 @@ from support.absolute_scenes import (
 )
 from support.kernel_scenes import squared_distances
 from support.paths import ROOT
+from support.public_names import classes_of
 
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.models import chunking
+from gpusense.models.landmark.base import FeatureModel
+from gpusense.models.point.base import PointModel
 from gpusense.models.point.bumper import sample_outline
 
 # -------------------------------------------------------------------------------------------------------- bumper
@@ -100,6 +103,12 @@ def test_a_bumper_of_ten_nanometres(backend: str, precision: str) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------- all sensors
+
+
+def test_every_sensor_has_a_row() -> None:
+    sensors = classes_of(PointModel) - classes_of(FeatureModel)
+    assert {type(model) for model, _ in models("numpy").values()} == sensors
+    assert MISSING.keys() == models("numpy").keys()
 
 
 @each_precision

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.array_libraries import Array, to_device
+from support.public_names import classes_of
 from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, NEAR, RANGE, SCANS, cloud, mixed
 from support.selection import BACKENDS
 
@@ -16,6 +17,14 @@ from gpusense.evaluation.tolerances import differing
 from gpusense.interface.launches import flags_of
 from gpusense.models import chunking
 from gpusense.models.scan import tiles
+from gpusense.models.scan.model import ScanModel
+
+
+def test_every_scan_model_has_cases_with_and_without_all_code():
+    made = [make(backend="numpy") for make in CASES.values()]
+    for specialize in (True, False):
+        kinds = {type(model) for model in made if model._context.rules.specialize is specialize}
+        assert kinds == classes_of(ScanModel)
 
 
 @pytest.mark.sampled(0.1)

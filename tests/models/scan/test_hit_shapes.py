@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mpmath import mp
 from scipy import stats
+from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.evaluation.range_data import RangeData, log_densities
@@ -123,6 +124,14 @@ def test_densities_are_those_of_40_digits(dof):
             truth = exact_log_hit(z, expected, sigma, dof)
             found = log_hit(z, expected, sigma, RANGE, shape=StudentHit(dof))
             assert abs(found - truth) <= 1e-11 * (1 + abs(truth)), (sigma, expected, z)
+
+
+def test_pages_and_docstrings_name_every_shape():
+    for name in SHAPES.keys() - {"normal"}:
+        assert f'hit="{name}"' in (ROOT / "docs" / "models.md").read_text(encoding="utf-8"), name
+        for file, times in (("world/parameters.py", 2), ("learning/beam/fit.py", 1)):
+            text = (ROOT / "gpusense" / file).read_text(encoding="utf-8")
+            assert text.count(f'``"{name}"``') >= times, (name, file)
 
 
 def test_cauchy_and_other_distributions_of_scipy():

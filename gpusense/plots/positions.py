@@ -78,7 +78,7 @@ def position_log_density(
         names=("sigma_range", "sigma_bearing"),
     )  # fmt: skip
     states = (places - problem.origin).reshape(-1, 2)
-    if problem.bearings is not None and heading is None:
+    if problem.bearings.size and heading is None:
         states = np.column_stack([states, _best_headings(problem, states)])
     scaled = problem.residuals(states) * problem.scales
     norm = np.log(problem.sigmas).sum() + 0.5 * math.log(2 * math.pi) * len(problem.sigmas)
@@ -88,7 +88,6 @@ def position_log_density(
 
 def _best_headings(problem: Problem, states: Floats) -> Floats:
     """Return the headings (N,) that fit the bearings best at (N, 2) positions [rad]."""
-    assert problem.bearings is not None
     offset = problem.points - (states[:, :1] + 1j * states[:, 1:])
     weight = problem.sigma_bearing**-2.0
     heading = np.angle((weight * np.exp(1j * (np.angle(offset) - problem.bearings))).sum(axis=1))
@@ -165,13 +164,13 @@ def _solution_curves(problem: Problem, reach: float) -> list[NDArray[np.complex1
     """Return the curves of possible positions as complex numbers; rays have length ``reach``."""
     world = problem.points + complex(*problem.origin)
     curves: list[NDArray[np.complex128]] = []
-    if problem.ranges is not None:
+    if problem.ranges.size:
         around = np.exp(1j * np.linspace(0, 2 * np.pi, FINE))
         curves += [m + r * around for m, r in zip(world, problem.ranges, strict=True)]
-    if problem.bearings is not None and problem.heading is not None:
+    if problem.bearings.size and problem.heading is not None:
         away = np.exp(1j * (problem.bearings + problem.heading))
         curves += [np.array([m, m - reach * u]) for m, u in zip(world, away, strict=True)]
-    elif problem.bearings is not None:
+    elif problem.bearings.size:
         for i in range(len(world)):
             for j in range(i):
                 curves.append(_arc(world[i], world[j], problem.bearings[j] - problem.bearings[i], reach))

@@ -121,7 +121,6 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
 
 def _angle_rounding(problem: Problem) -> float:
     """Return the rounding error of the bearings, which may be reduced by whole turns."""
-    assert problem.bearings is not None
     return EPS * (4 * ROUNDINGS + float(np.abs(problem.bearings).max()))
 
 
@@ -132,7 +131,6 @@ def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | No
     nearly one direction this exceeds the terms. Rounded coordinates affect the direction to a near beacon most; None as
     ``state`` assumes a robot at the beacons' distance from each other.
     """
-    assert problem.bearings is not None
     points, bearings = problem.points[triples], problem.bearings[triples]
     away = np.abs(points - points.mean(axis=1, keepdims=True))
     angle = bearings[:, [1, 2, 0]] - bearings[:, [2, 0, 1]]
@@ -162,7 +160,6 @@ def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix
 
 def _no_solution(problem: Problem) -> str:
     """Return the status of beacons or lines of sight that determine no point or infinitely many, else ""."""
-    assert problem.bearings is not None
     places = np.unique(problem.xy, axis=0)
     if len(places) == 1 or (problem.heading is None and len(places) == 2):
         return "coincident"
@@ -182,7 +179,7 @@ def _no_solution(problem: Problem) -> str:
 
 def _rays(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
     """Intersect pairs of lines of sight: (N, 2) points, (N, 2) distances and (N,) sines."""
-    assert problem.bearings is not None and problem.heading is not None
+    assert problem.heading is not None
     angle, (i, j) = problem.bearings + problem.heading, pairs.T
     point, rho, sine = two_rays(problem.points[i], problem.points[j], angle[i], angle[j])
     return np.column_stack([point.real, point.imag]), rho, np.abs(sine)
@@ -190,14 +187,13 @@ def _rays(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, Floats, Fl
 
 def _triples(problem: Problem, triples: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
     """Solve triples of beacons: (N, 3) poses, (N, 3) distances, and (N,) clarities of the poses."""
-    assert problem.bearings is not None
     point, heading, rho, clarity = three_bearings(problem.points[triples], problem.bearings[triples])
     return np.column_stack([point.real, point.imag, heading]), rho, clarity
 
 
 def _nearest_point(problem: Problem) -> Floats:
     """Return (1, 2) the point nearest to all lines of sight, the minimum of sum of s_i^2 (n_i (p - m_i))^2."""
-    assert problem.bearings is not None and problem.heading is not None
+    assert problem.heading is not None
     angle = problem.bearings + problem.heading
     normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1) * problem.scales[:, None]
     return np.linalg.lstsq(normal, np.sum(normal * problem.xy, axis=1), rcond=None)[0][None]
@@ -209,7 +205,6 @@ def _linear_pose(problem: Problem) -> Floats:
     The equations are linear and homogeneous in q and s; the right singular vector of the least singular value solves
     them in least squares.
     """
-    assert problem.bearings is not None
     turn, length = np.exp(-1j * problem.bearings), problem.spread
     seen = problem.points / length * turn
     rows = np.column_stack([seen.imag, seen.real, -turn.imag, -turn.real]) * problem.scales[:, None]

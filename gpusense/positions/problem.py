@@ -42,11 +42,11 @@ class Problem:
 
     xy: Floats  # (M, 2) beacons relative to ``origin`` [m]
     origin: Floats  # (2,) origin in the world [m]; it keeps all digits of UTM coordinates
-    ranges: Floats | None  # (M,) or None [m]
-    bearings: Floats | None  # (M,) or None [rad]
+    ranges: Floats  # (M,), or (0,) if they were not measured [m]
+    bearings: Floats  # (M,), or (0,) if they were not measured [rad]
     heading: float | None  # the known heading, or None [rad]
-    sigma_range: Floats  # (M,) standard deviations [m]
-    sigma_bearing: Floats  # (M,) standard deviations [rad]
+    sigma_range: Floats  # standard deviations of the ranges [m]
+    sigma_bearing: Floats  # standard deviations of the bearings [rad]
     weights: Floats  # (M,) factors > 0 of the squared residuals
     loss: str  # name of one of LOSSES
     loss_scale: float  # residual at which the loss bends [sigma]
@@ -55,7 +55,7 @@ class Problem:
     @property
     def dimension(self) -> int:
         """Number of unknowns: 2 for a position, 3 for a pose."""
-        return 2 if self.bearings is None or self.heading is not None else 3
+        return 3 if self.bearings.size and self.heading is None else 2
 
     @property
     def points(self) -> Complexes:
@@ -65,8 +65,8 @@ class Problem:
     @property
     def spread(self) -> float:
         """Length scale of the scene: the largest distance of a beacon from the mean, or the largest range."""
-        reach = float(np.hypot(*(self.xy - self.xy.mean(axis=0)).T).max())
-        return max(reach, 0.0 if self.ranges is None else float(self.ranges.max()))
+        reach = np.hypot(*(self.xy - self.xy.mean(axis=0)).T).max()
+        return float(self.ranges.max(initial=reach))
 
     @functools.cached_property
     def touch(self) -> float:
@@ -86,9 +86,9 @@ class Problem:
         """Return measured less expected values at (S, d) states: (S, M), or (S, 2 M) for ranges and bearings."""
         offset = self.xy - states[:, None, :2]
         parts = []
-        if self.ranges is not None:
+        if self.ranges.size:
             parts.append(self.ranges - np.hypot(offset[..., 0], offset[..., 1]))
-        if self.bearings is not None:
+        if self.bearings.size:
             theta = states[:, 2:] if self.heading is None else self.heading
             parts.append(wrap(self.bearings + theta - np.arctan2(offset[..., 1], offset[..., 0])))
         return np.concatenate(parts, axis=1)
@@ -101,23 +101,21 @@ class Problem:
         safe = np.where(known, rho, 1.0)
         cosine, sine = np.where(known, dx / safe, 0.0), np.where(known, dy / safe, 0.0)
         parts = []
-        if self.ranges is not None:
+        if self.ranges.size:
             parts.append(np.column_stack([-cosine, -sine, np.zeros_like(rho)]))
-        if self.bearings is not None:
+        if self.bearings.size:
             parts.append(np.column_stack([sine / safe, -cosine / safe, np.where(known, -1.0, 0.0)]))
         return np.concatenate(parts)[:, : self.dimension]
 
     @property
     def sigmas(self) -> Floats:
         """(R,) standard deviations of the measurements in the order of the residuals."""
-        parts = [] if self.ranges is None else [self.sigma_range]
-        return np.concatenate(parts if self.bearings is None else [*parts, self.sigma_bearing])
+        return np.concatenate([self.sigma_range, self.sigma_bearing])
 
     @property
     def scales(self) -> Floats:
         """(R,) factors sqrt(weight) / sigma of the residuals in the cost."""
-        both = self.ranges is not None and self.bearings is not None
-        return np.sqrt(np.tile(self.weights, 2) if both else self.weights) / self.sigmas
+        return np.sqrt(np.resize(self.weights, self.sigmas.shape)) / self.sigmas
 
     def rho(self, scaled: Floats) -> tuple[Floats, Floats]:
         """Return the losses of scaled residuals, and their weights under a robust loss."""
@@ -214,13 +212,15 @@ def make_problem(
     """Check the arguments of a public function and make a problem without the beacons of weight 0."""
     positions = checks.array("xy", xy, ("M", 2), largest=checks.FARTHEST)
     count = len(positions)
-    distances = None if ranges is None else _not_negative("ranges", ranges, count, checks.FARTHEST)
-    angles = None if bearings is None else checks.array("bearings", bearings, (count,), largest=checks.FARTHEST)
+    none = np.zeros(0)
+    distances = none if ranges is None else _not_negative("ranges", ranges, count, checks.FARTHEST)
+    angles = none if bearings is None else checks.array("bearings", bearings, (count,), largest=checks.FARTHEST)
     look_at_bearings("bearings", angles)
     theta = None if heading is None else checks.real("heading", heading)
     if theta is not None:
         checks.array("heading", theta, largest=checks.FARTHEST)
-    sigma_r, sigma_b = deviations(names[0], sigma_range, count), deviations(names[1], sigma_bearing, count)
+    sigma_r = none if ranges is None else deviations(names[0], sigma_range, count)
+    sigma_b = none if bearings is None else deviations(names[1], sigma_bearing, count)
     factors = np.ones(count) if weights is None else _not_negative("weights", weights, count, _LARGE)
     loss = checks.choice("loss", loss, tuple(LOSSES))
     loss_scale = checks.real("loss_scale", checks.real("loss_scale", loss_scale, above=0), low=_SMALL, high=_LARGE)
@@ -235,10 +235,10 @@ def make_problem(
     origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
     relative = positions - origin
     relative[np.abs(relative) < _SAME_PLACE] = 0.0
-    return Problem(
-        relative, origin, None if distances is None else distances[used], None if angles is None else angles[used],
-        theta, sigma_r[used], sigma_b[used], factors, loss, loss_scale, used,
-    )  # fmt: skip
+    distances, angles, sigma_r, sigma_b = (
+        one[used] if len(one) else one for one in (distances, angles, sigma_r, sigma_b)
+    )
+    return Problem(relative, origin, distances, angles, theta, sigma_r, sigma_b, factors, loss, loss_scale, used)
 
 
 def _not_negative(name: str, values: ArrayLike, count: int, largest: float) -> Floats:

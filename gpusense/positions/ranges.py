@@ -78,7 +78,6 @@ def trilaterate(
 
 def _pairs(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, NDArray[np.str_]]:
     """Intersect the circles of (N, 2) pairs of beacons: (2 N, 2) points and (N,) statuses; see ``two_circles``."""
-    assert problem.ranges is not None
     i, j = pairs.T
     variance = problem.sigma_range**2 / problem.weights
     points, status = two_circles(
@@ -95,7 +94,6 @@ def _linearised(problem: Problem) -> Floats:
     Each equation is |p|^2 - 2 m p + |m|^2 = d^2, less the weighted mean of all. Beacons in line put the point on their
     line.
     """
-    assert problem.ranges is not None
     share = problem.scales**2 / np.sum(problem.scales**2)
     right = (np.sum(problem.xy**2, axis=1) - problem.ranges**2) / 2
     root = np.sqrt(share)
@@ -107,7 +105,6 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     """Solve for beacons in line: return a solution and its mirror image, or a solution on the line."""
     point, direction = line
     normal = np.array([-direction[1], direction[0]])
-    assert problem.ranges is not None
     along = ((problem.xy - point) @ direction)[:, None] + problem.ranges[:, None] * (-1, 1)
     on, on_cost = minima(problem, point + along.reshape(-1, 1) * direction, line)
     # Mirror images cost the same: search the left side only.
@@ -189,7 +186,6 @@ def locate(
     )  # fmt: skip
     if heading is None and np.hypot(*(problem.xy - problem.xy[0]).T).max() <= problem.noise:
         return problem.fix([], "coincident")
-    assert problem.ranges is not None
     # A huge standard deviation removes the meaningless bearing to a beacon at range 0.
     problem = replace(
         problem, sigma_bearing=np.where(problem.ranges <= problem.touch, NO_BEARING, problem.sigma_bearing)
@@ -199,7 +195,6 @@ def locate(
 
 def _starts(problem: Problem) -> Floats:
     """Return (N, d) starts: rigid motions of all beacons and of pairs, and intersections of circles with headings."""
-    assert problem.ranges is not None and problem.bearings is not None
     world, count = problem.points, len(problem.xy)
     if problem.heading is not None:
         # Each beacon and a known heading determine a position.
@@ -223,7 +218,6 @@ def _rigid(problem: Problem, sets: NDArray[np.intp]) -> tuple[NDArray[np.complex
     The heading of least squares is the angle of sum conj(z_i - z) (m_i - m), with means z and m (Horn 1987, in the
     plane).
     """
-    assert problem.ranges is not None and problem.bearings is not None
     seen = (problem.ranges * np.exp(1j * problem.bearings))[sets]
     world = problem.points[sets]
     # Error of a measured point, along and across the ray.

@@ -52,9 +52,9 @@ def _notice(text: str) -> None:
     warn_user(text, PlausibilityWarning)
 
 
-def look_at_bearings(name: str, bearings: NDArray[np.float64] | None) -> None:
-    """Warn of bearings that span more than a turn, or exceed two turns [rad]; None is skipped."""
-    if bearings is None or not bearings.size:
+def look_at_bearings(name: str, bearings: NDArray[np.float64]) -> None:
+    """Warn of bearings that span more than a turn, or exceed two turns [rad]."""
+    if not bearings.size:
         return
     low, high = float(bearings.min()), float(bearings.max())
     if high - low > _TURN * (1 + 1 / bearings.size):

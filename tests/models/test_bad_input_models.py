@@ -134,7 +134,7 @@ LANDMARK_CASES = [
     (features(LINES, [[0.0, 1.0, 0.0]]), V, "features: shape must be (F, 2), (F, 4) or (F, 7), got (1, 3)"),
     (features(LINES, [[0, 1, 0, 1, 0.1, 0.2, 0.1]]), V,
      "features: covariance must be positive semidefinite, got [0.1, 0.2, 0.1] at index 0"),
-    (features(LINES, [[0, 1]], [2]), V, "correspondence: indices must be in [-1, 2), got 2 at index 0"),
+    (features(LINES, [[0, 1]], [2]), V, "correspondence: every index must be in [-1, 2), got 2 at index 0"),
     (lambda: gs.LandmarkParameters(sigma_range=None, sigma_bearing=None), V,
      "sigma_range + sigma_bearing + sigma_signature: must not all be None, got None"),
     (lambda: gs.LandmarkParameters(z_detect=0.9), V,

@@ -197,10 +197,7 @@ def _sightings(
     full = check_features(features, with_signature, base.signature_span or (-math.inf, math.inf))
     x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,), largest=checks.FARTHEST))
     robots = checks.array("poses", poses, (len(full) if scan is None else "S", 3), largest=checks.FARTHEST)
-    index = np.arange(len(full)) if scan is None else checks.array("scan", scan, (len(full),), dtype=np.int64)
-    bad = np.flatnonzero((index < 0) | (index >= len(robots)))
-    if len(bad):
-        raise ValueError(f"scan: indices must be in [0, {len(robots)}), got {index[bad[0]]} at index {bad[0]}")
+    index = np.arange(len(full)) if scan is None else checks.indices("scan", scan, len(robots), (len(full),))
     known = None if correspondence is None else check_correspondence(correspondence, len(full), len(landmarks))
     used = np.flatnonzero((~np.isnan(full)).any(axis=1))
     if not len(used):

@@ -77,29 +77,19 @@ class _Beacons(Problem):
         bias = biases[self.ids] if self.biases > 1 else float(biases.sum())
         mean = self.distances + bias
         residual = (self.ranges - self.distances) - bias
-        rand = theta[1]
-        share = theta[3] if self.kind == "mixture" else 0.0
-        first = truncated(
-            residual, mean, self.range_max, math.exp(theta[0]), NORMAL if self.nu is None else StudentHit(self.nu)
-        )
-        parts = [
-            ((1 - rand) * (1 - share), first[0]),
-            (rand, np.full(len(mean), RandomDensity(self.range_max).log_peak(1.0))),
-        ]
-        hits = [first]
-        if self.kind == "mixture":
-            hits.append(truncated(residual, mean, self.range_max, math.exp(theta[2]), NORMAL))
-            parts.append(((1 - rand) * share, hits[1][0]))
-        log_p, shares, ratios = mix(parts)
-        gradient = np.zeros((len(mean), len(theta)))
-        of_hits = [shares[0], *shares[2:]]
-        hit_ratio = (1 - share) * ratios[0] + (share * ratios[2] if self.kind == "mixture" else 0)
-        gradient[:, 0] = of_hits[0] * first[1]
-        gradient[:, 1] = ratios[1] - hit_ratio
-        if self.kind == "mixture":
-            gradient[:, 2] = of_hits[1] * hits[1][1]
-            gradient[:, 3] = (1 - rand) * (ratios[2] - ratios[0])
-        by_bias = sum(of * hit[2] for of, hit in zip(of_hits, hits, strict=True))
+        rand, weights = theta[1], [1 - theta[3], theta[3]] if self.kind == "mixture" else [1.0]
+        shape = NORMAL if self.nu is None else StudentHit(self.nu)
+        hits = [truncated(residual, mean, self.range_max, math.exp(scale), shape) for scale in theta[: self._first : 2]]
+        first, *heavy = (((1 - rand) * weight, hit[0]) for weight, hit in zip(weights, hits, strict=True))
+        flat = np.full(len(mean), RandomDensity(self.range_max).log_peak(1.0))
+        log_p, shares, ratios = mix([first, (rand, flat), *heavy])
+        gradient, hit_shares, hit_ratios = np.zeros((len(mean), len(theta))), shares[::2], ratios[::2]
+        for column, share, hit in zip((0, 2), hit_shares, hits, strict=False):
+            gradient[:, column] = share * hit[1]
+        gradient[:, 1] = ratios[1] - sum(weight * ratio for weight, ratio in zip(weights, hit_ratios, strict=True))
+        if heavy:
+            gradient[:, 3] = (1 - rand) * (hit_ratios[1] - hit_ratios[0])
+        by_bias = sum(share * hit[2] for share, hit in zip(hit_shares, hits, strict=True))
         if self.biases:
             place = self.ids if self.biases > 1 else np.zeros(len(mean), np.int64)
             gradient[np.arange(len(mean)), self._first + place] = by_bias
@@ -208,11 +198,7 @@ def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) ->
         table = checks.array("ranges", ranges, (len(pose), beacons), finite=False)
         rows, columns = (each.ravel().astype(np.int64) for each in np.indices(table.shape))
         return pose, table.ravel(), [rows, columns]
-    columns = checks.array("ids", ids, ("F",), dtype=np.int64)
+    columns = checks.indices("ids", ids, beacons, ("F",))
     pose = checks.array("poses", poses, (len(columns), 3), largest=checks.FARTHEST)
-    outside = np.flatnonzero((columns < 0) | (columns >= beacons))
-    if len(outside):
-        at = outside[0]
-        raise ValueError(f"ids: indices must be in [0, {beacons}), got {columns[at]} at index {at}")
     z = checks.array("ranges", ranges, (len(columns),), finite=False)
     return pose, z, [np.arange(len(columns)), columns]

@@ -27,7 +27,7 @@ from gpusense.models.landmark.features import (
     full_circle,
     look_at_feature_angles,
 )
-from gpusense.models.point.base import PointModel
+from gpusense.models.point.base import PointModel, counted_omissions, float64_omissions
 from gpusense.models.poses import Part, PlacedPoses, Poses, place
 from gpusense.world.frames import Mount
 from gpusense.world.landmarks import Buckets
@@ -178,7 +178,7 @@ class FeatureModel(PointModel):
 
     def _evaluate(
         self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
-    ) -> tuple[Any, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return log p of each particle; with ``each`` also the (N, F) landmarks and terms of the features."""
         full, impossible = self._read(arrays.copied_to_host(features, self._backend, "features"))
         call = self._prepare(full, correspondence, each)
@@ -307,24 +307,18 @@ def common_omissions(mount: Mount, precision: str) -> list[Omission]:
     omissions = []
     if mount[:2] == (0.0, 0.0):
         omissions.append(Omission("mount", "the sensor sits at the robot's origin", "a rotation per particle"))
-    if precision == "float32":
-        why = "positions, angles and exponents are kept in two numbers"
-        omissions.append(Omission("float64", why, "wide units, which many devices lack"))
-    return omissions
+    why = "positions, angles and exponents are kept in two numbers"
+    return omissions + float64_omissions(precision, why, "wide units, which many devices lack")
 
 
 def feature_omissions(
     prepared: PreparedFeatures, buckets: Buckets, *, name: str, total: int, impossible: int, known: bool
 ) -> list[Omission]:
     """Return the omissions by the features of a call; ``known``: whether the correspondences are known."""
-    omissions, count = [], len(buckets.index)
-    silent = total - len(prepared.columns) - impossible
-    for number, what, why in (
-        (impossible, "impossible features", "have a part that the sensor cannot measure"),
-        (silent, "features", "do not depend on the pose"),
-    ):
-        if number:
-            omissions.append(Omission(what, f"{number} of {total} features {why}", f"{share(number, total)} of them"))
+    count, silent = len(buckets.index), total - len(prepared.columns) - impossible
+    why = "features have a part that the sensor cannot measure"
+    omissions = counted_omissions("impossible features", impossible, total, why, "them")
+    omissions += counted_omissions("features", silent, total, "features do not depend on the pose", "them")
     if known:
         omissions.append(Omission("search", "correspondences are known", f"{count - 1} of {count} {name}"))
     elif len(prepared.columns) and np.isfinite(prepared.radius).any():

@@ -22,26 +22,32 @@ from gpusense.world.plausible import look_at_bearings
 
 # Discs are widened by this share, for rounding errors of distances.
 _WIDER = 1e-5
-# Columns of low parts, and the columns that they belong to.
-_LOW_PARTS = (
+# Columns of low parts, and the columns that they belong to, of lines as well, and of landmarks.
+LOW_PARTS = (
     (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
     (at.SIGNATURE_LOW, at.SIGNATURE_AT), (at.RANGE_SCALE_LOW, at.RANGE_SCALE),
-    (at.BEARING_SCALE_LOW, at.BEARING_SCALE), (at.SIGNATURE_SCALE_LOW, at.SIGNATURE_SCALE),
-    (at.PEAK_LOW, at.PEAK), (at.UPPER_LOW, at.UPPER),
+    (at.BEARING_SCALE_LOW, at.BEARING_SCALE), (at.SIGNATURE_SCALE_LOW, at.SIGNATURE_SCALE), (at.PEAK_LOW, at.PEAK),
 )  # fmt: skip
+_LOW_PARTS = (*LOW_PARTS, (at.UPPER_LOW, at.UPPER))
+
+
+def read_table(features: object, columns: Sequence[int]) -> np.ndarray:
+    """Return features of one of some numbers of columns, as (F, largest number) float64 with NaN in further columns."""
+    values = checks.as_array("features", features, masked=True)
+    values = np.zeros((0, columns[0])) if values.shape == (0,) else checks.array("features", values, finite=False)
+    if values.ndim != 2 or values.shape[1] not in columns:
+        *first, last = (f"(F, {count})" for count in columns)
+        got = checks.shape_text(values.shape)
+        raise ValueError(f"features: shape must be {', '.join(first)} or {last}, got {got}")
+    full = np.full((len(values), columns[-1]), np.nan)
+    full[:, : values.shape[1]] = values
+    return full
 
 
 def _read(features: object, p: LandmarkParameters) -> np.ndarray:
     """Return (F, 3) float64 features, NaN for parts not measured or left out; finite bearings are in [-pi, pi]."""
-    values = checks.as_array("features", features, masked=True)
-    values = np.zeros((0, 2)) if values.shape == (0,) else checks.array("features", values, finite=False)
-    if values.ndim != 2 or values.shape[1] not in (2, 3):
-        raise ValueError(f"features: shape must be (F, 2) or (F, 3), got {checks.shape_text(values.shape)}")
-    full = np.full((len(values), 3), np.nan)
-    full[:, : values.shape[1]] = values
-    for column, sigma in enumerate((p.sigma_range, p.sigma_bearing, p.sigma_signature)):
-        if sigma is None:
-            full[:, column] = np.nan
+    full = read_table(features, (2, 3))
+    full[:, [sigma is None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]] = np.nan
     finite = np.isfinite(full[:, 1])
     full[finite, 1] = wrapped(full[finite, 1])
     return full
@@ -98,12 +104,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 def check_correspondence(correspondence: object, count: int, landmarks: int) -> np.ndarray:
     """Return the (F,) landmark of each feature, -1 for none."""
-    indices = checks.array("correspondence", correspondence, (count,), dtype=np.int64)
-    bad = np.flatnonzero((indices < -1) | (indices >= landmarks))
-    if len(bad):
-        rule = f"indices must be in [-1, {landmarks})"
-        raise ValueError(f"correspondence: {rule}, got {indices[bad[0]]} at index {bad[0]}")
-    return indices
+    return checks.indices("correspondence", correspondence, landmarks, (count,), low=-1)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import FeatureTerms
 from gpusense.models.landmark.base import JOINT_FEATURES, FeatureModel, common_omissions
-from gpusense.models.landmark.features import PreparedFeatures, in_two_parts, uploaded
+from gpusense.models.landmark.features import LOW_PARTS, PreparedFeatures, in_two_parts, read_table, uploaded
 from gpusense.models.landmark.sampling import draw_lines
 from gpusense.models.point.sampling import draws_at
 from gpusense.world.frames import Mount, split
@@ -124,7 +124,7 @@ class LineModel(FeatureModel):
             ValueError: A wrong shape, a pose that is not finite, a covariance that is not positive semidefinite, an
                 index outside the map, or more than 8 lines for a joint association.
         """
-        return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
+        return self._evaluate(poses, features, correspondence, out=out)[0]
 
     def sample(
         self, poses: AnyArray, seed: int = 0, *, step: int = 0, correspondence: ArrayLike | None = None
@@ -158,9 +158,7 @@ class LineModel(FeatureModel):
             (5, 2, 4)
         """
         draws, partners = draws_at(poses, self._backend, seed, step), self._partners(correspondence)
-        return draw_lines(
-            draws, partners, self.lines, self.parameters, self.mount, every=correspondence is not None
-        )  # fmt: skip
+        return draw_lines(draws, partners, self.lines, self.parameters, self.mount, every=correspondence is not None)
 
     def _describe(self) -> tuple[str, list[Omission]]:
         return f"line model, {self.association}", common_omissions(self.mount, self.precision)
@@ -186,16 +184,8 @@ class LineModel(FeatureModel):
 
 
 ANGLE, DISTANCE, FIRST, LAST, ANGLE_VARIANCE, MIXED, DISTANCE_VARIANCE = range(7)
-# Columns of features: angle and distance; and the ends; and the covariance.
-_COLUMNS = (2, 4, 7)
 # Distance assumed for unknown ends [m].
 _UNKNOWN_END = 1e9
-# Columns of low parts, and the columns that they belong to.
-_LOW_PARTS = (
-    (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
-    (at.RANGE_SCALE_LOW, at.RANGE_SCALE), (at.BEARING_SCALE_LOW, at.BEARING_SCALE),
-    (at.MIXED_SCALE_LOW, at.MIXED_SCALE), (at.PEAK_LOW, at.PEAK),
-)  # fmt: skip
 # Gates are widened by this share, for rounding errors.
 _WIDER = 1e-5
 # Two features may belong to the same line if their angles differ by less than this [rad].
@@ -204,12 +194,8 @@ _ALIKE = 0.5
 
 def possible_lines(features: object, p: LineParameters) -> tuple[np.ndarray, np.ndarray]:
     """Return (F, 7) lines, all NaN where impossible or not measured, and (F,) whether they are impossible."""
-    values = checks.as_array("features", features, masked=True)
-    values = np.zeros((0, 7)) if values.shape == (0,) else checks.array("features", values, finite=False)
-    if values.ndim != 2 or values.shape[1] not in _COLUMNS:
-        raise ValueError(f"features: shape must be (F, 2), (F, 4) or (F, 7), got {checks.shape_text(values.shape)}")
-    full = np.full((len(values), 7), np.nan)
-    full[:, : values.shape[1]] = values
+    # Angle and distance; and the ends; and the covariance.
+    full = read_table(features, (2, 4, 7))
     unknown = np.isnan(full[:, [FIRST, LAST]]).any(axis=1)
     full[:, FIRST] = np.where(unknown, -_UNKNOWN_END, full[:, [FIRST, LAST]].min(axis=1))
     full[:, LAST] = np.where(unknown, _UNKNOWN_END, full[:, [FIRST, LAST]].max(axis=1))
@@ -294,7 +280,7 @@ def prepare_lines(
     if len(kept) <= grouped:
         numbers[:, at.GROUP] = _groups(kept)
     _gate(numbers, kept, w, p, real, extent=extent, longest=longest, gated=gated)
-    rounded = in_two_parts(numbers, real, _LOW_PARTS)
+    rounded = in_two_parts(numbers, real, LOW_PARTS)
     return PreparedFeatures(columns, rounded, np.ones((len(columns), 3), bool), false)
 
 

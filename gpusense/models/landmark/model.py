@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,7 +130,7 @@ class LandmarkModel(FeatureModel):
             ValueError: A wrong shape, a pose that is not finite, an index outside the map, or more than 8
                 features for a joint association.
         """
-        return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
+        return self._evaluate(poses, features, correspondence, out=out)[0]
 
     def _arguments(self) -> dict[str, Any]:
         return super()._arguments() | {"negative": self.negative}

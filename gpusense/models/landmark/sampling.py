@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
-from gpusense.models.landmark.features import wrapped
+from gpusense.models.landmark.features import wrapped as within_half_turn
 from gpusense.models.point.sampling import (
     LANDMARKS,
     LINES,
@@ -14,10 +17,11 @@ from gpusense.models.point.sampling import (
     mounted,
     normal_within,
     standard_normal,
+    wrapped,
     wrapped_normal_within,
 )
 from gpusense.reference.landmarks import ZERO_RANGE
-from gpusense.reference.relative import wrapped_difference
+from gpusense.world.frames import Mount
 from gpusense.world.landmarks import LandmarkMap, LineMap
 from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.sensor_parameters import LineParameters
@@ -26,108 +30,97 @@ Span = tuple[float, float]
 
 
 def draw_features(
-    draws: Draws,
-    partners: NDArray[np.int64],
-    landmarks: LandmarkMap,
-    p: LandmarkParameters,
-    span: Span,
-    mount: tuple[float, float, float],
-    *,
-    every: bool,
-) -> Floats:
+    draws: Draws, partners: NDArray[np.int64], landmarks: LandmarkMap, p: LandmarkParameters, span: Span, mount: Mount,
+    *, every: bool,
+) -> Floats:  # fmt: skip
     """Return features of the landmarks ``partners`` (F,), -1 for a false positive; ``every``: also out of view."""
-    columns = 2 if p.sigma_signature is None else 3
-    features = np.full((len(draws.poses), len(partners), columns), np.nan)
-    place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))
-    turned = wrapped_difference(draws.poses[:, 2], none)[0] + wrapped_difference(np.array([mount[2]]), none)[0]
+    place, turned = _sensors(draws, mount)
+    measured = [sigma is not None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]
+
+    def false(u: Floats, v: Floats, w: Floats, _: Floats) -> Floats:
+        return _parts(u * p.range_max, (v - 0.5) * p.field_of_view, span[0] + w * (span[1] - span[0]), measured)
+
+    def true(j: int, u: Floats, v: Floats, w: Floats, _: Floats) -> tuple[Floats, NDArray[np.bool]]:
+        dx, dy = (landmarks.xy[j] - place).T
+        distance, bearing = np.hypot(dx, dy), wrapped(np.arctan2(dy, dx) - turned)
+        signature = np.nan if landmarks.signatures is None else float(landmarks.signatures[j])
+        seen = (distance <= p.range_max) & (np.abs(bearing) <= p.field_of_view / 2)
+        return _parts(*_detections(u, v, w, distance, bearing, signature, p, span), measured), seen
+
+    return _drawn(draws, LANDMARKS, partners, p, measured, false, true, every=every)[..., : 2 + measured[2]]
+
+
+def _sensors(draws: Draws, mount: Mount) -> tuple[Floats, Floats]:
+    """Return the (N, 2) positions of the sensor, and its headings, each within a turn."""
+    return mounted(draws.poses, mount), wrapped(draws.poses[:, 2]) + wrapped(np.array([mount[2]]))
+
+
+def _drawn(
+    draws: Draws, stream: int, partners: NDArray[np.int64], p: LandmarkParameters | LineParameters,
+    measured: Sequence[bool], false: Callable[..., Floats], true: Callable[..., tuple[Floats, NDArray[np.bool]]], *,
+    every: bool,
+) -> Floats:  # fmt: skip
+    """Return (N, F, columns) features.
+
+    ``false`` and ``true`` draw a false positive, and the feature of a landmark and whether it is in view, from four
+    numbers in (0, 1). A feature with an unobservable ``measured`` part is not reported.
+    """
+    features = np.full((len(draws.poses), len(partners), len(measured)), np.nan)
     for f, j in enumerate(partners.tolist()):
-        stream = LANDMARKS + f
-        (kind, detected), (u, v) = draws.uniform(stream), draws.uniform(stream, 1)
-        w = draws.uniform(stream, 2)[0]
-        drawn = _false_positives(u, v, w, p, span)
+        (kind, detected), (u, v), (w, x) = (draws.uniform(stream + f, call) for call in range(3))
+        drawn = false(u, v, w, x)
         if j >= 0:
-            dx, dy = (landmarks.xy[j] - place).T
-            distance = np.hypot(dx, dy)
-            bearing = wrapped_difference(np.arctan2(dy, dx) - turned, none)[0]
-            signature = None if landmarks.signatures is None else float(landmarks.signatures[j])
-            true = _detections(u, v, w, distance, bearing, signature, p, span)
-            drawn = np.where((kind * (p.z_detect + p.z_false) < p.z_detect)[:, None], true, drawn)
+            feature, seen = true(j, u, v, w, x)
+            drawn = np.where((kind * (p.z_detect + p.z_false) < p.z_detect)[:, None], feature, drawn)
             if not every:
-                seen = (distance <= p.range_max) & (np.abs(bearing) <= p.field_of_view / 2) & (detected < p.p_detect)
-                drawn[~seen] = np.nan
-        # A feature with an unobservable measured part is not reported.
-        measured = [sigma is not None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]
+                drawn[~(seen & (detected < p.p_detect))] = np.nan
         drawn[np.isnan(drawn[:, measured]).any(axis=1)] = np.nan
-        features[:, f] = drawn[:, :columns]
+        features[:, f] = drawn
     return draws.reshaped(features)
 
 
-def _false_positives(u: Floats, v: Floats, w: Floats, p: LandmarkParameters, span: Span) -> Floats:
-    """Return (N, 3) features uniform within the sensor's limits, NaN for parts without a deviation."""
-    return _parts(u * p.range_max, (v - 0.5) * p.field_of_view, span[0] + w * (span[1] - span[0]), p)
-
-
 def _detections(
-    u: Floats,
-    v: Floats,
-    w: Floats,
-    distance: Floats,
-    bearing: Floats,
-    signature: float | None,
-    p: LandmarkParameters,
+    u: Floats, v: Floats, w: Floats, distance: Floats, bearing: Floats, signature: float, p: LandmarkParameters,
     span: Span,
-) -> Floats:
-    """Return (N, 3) features of a landmark, NaN for parts without a deviation and for unobserved ones."""
-    nan = np.full_like(u, np.nan)
-    r = nan if p.sigma_range is None else normal_within(u, distance, p.sigma_range, 0.0, p.range_max)
-    b = nan
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    """Return range, bearing and signature of a landmark, NaN for parts without a deviation and for unobserved ones."""
+    r = b = s = np.full_like(u, np.nan)
+    if p.sigma_range is not None:
+        r = normal_within(u, distance, p.sigma_range, 0.0, p.range_max)
     if p.sigma_bearing is not None:
         half = min(p.field_of_view / 2, np.pi)
         b = wrapped_normal_within(v, bearing, p.sigma_bearing, half)
         # A landmark at the sensor has no bearing.
         b = np.where(distance > ZERO_RANGE, b, (2 * v - 1) * half)
-    s = nan
-    if p.sigma_signature is not None and signature is not None:
+    if p.sigma_signature is not None and not np.isnan(signature):
         s = normal_within(w, np.full_like(u, signature), p.sigma_signature, *span)
-    return _parts(r, b, s, p)
+    return r, b, s
 
 
-def _parts(r: Floats, b: Floats, s: Floats, p: LandmarkParameters) -> Floats:
-    parts = np.stack([r, b, s], axis=1)
-    parts[:, [sigma is None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]] = np.nan
-    return parts
+def _parts(r: Floats, b: Floats, s: Floats, measured: Sequence[bool]) -> Floats:
+    """Return (N, 3) features, NaN in parts without a deviation."""
+    return np.where(measured, np.stack([r, b, s], axis=1), np.nan)
 
 
 def draw_lines(
-    draws: Draws, partners: NDArray[np.int64], lines: LineMap, p: LineParameters, mount: tuple[float, float, float], *,
-    every: bool,
-) -> Floats:  # fmt: skip
+    draws: Draws, partners: NDArray[np.int64], lines: LineMap, p: LineParameters, mount: Mount, *, every: bool
+) -> Floats:
     """Return (N, F, 4) features of the lines ``partners`` (F,), -1 for a false positive; NaN for lines out of view.
 
     ``every``: whether every line is detected, also from behind.
     """
-    features = np.full((len(draws.poses), len(partners), 4), np.nan)
-    place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))
-    turned = wrapped_difference(draws.poses[:, 2], none)[0] + wrapped_difference(np.array([mount[2]]), none)[0]
-    normals = lines.normals
-    for f, j in enumerate(partners.tolist()):
-        stream = LINES + f
-        (kind, detected), (u, v) = draws.uniform(stream), draws.uniform(stream, 1)
-        ends = draws.uniform(stream, 2)
-        drawn = _false_lines(u, v, *ends, p)
-        if j >= 0:
-            true, seen = _seen(place, turned, lines.segments[j], normals[j], bool(lines.two_sided[j]), p)
-            true[:, :2] += _errors(u, v, true, p)
-            true[:, 0] = wrapped(true[:, 0])
-            drawn = np.where((kind * (p.z_detect + p.z_false) < p.z_detect)[:, None], true, drawn)
-            if not every:
-                drawn[~(seen & (detected < p.p_detect))] = np.nan
-        drawn[np.isnan(drawn).any(axis=1)] = np.nan
-        features[:, f] = drawn
-    return draws.reshaped(features)
+    (place, turned), normals = _sensors(draws, mount), lines.normals
+
+    def true(j: int, u: Floats, v: Floats, *_: Floats) -> tuple[Floats, NDArray[np.bool]]:
+        line, seen = _seen(place, turned, lines.segments[j], normals[j], bool(lines.two_sided[j]), p)
+        line[:, :2] += _errors(u, v, line, p)
+        line[:, 0] = within_half_turn(line[:, 0])
+        return line, seen
+
+    return _drawn(draws, LINES, partners, p, [True] * 4, functools.partial(_false_lines, p), true, every=every)
 
 
-def _false_lines(u: Floats, v: Floats, w: Floats, x: Floats, p: LineParameters) -> Floats:
+def _false_lines(p: LineParameters, u: Floats, v: Floats, w: Floats, x: Floats) -> Floats:
     """Return (N, 4) lines uniform in angle and distance, with ends within range_max."""
     ends = np.sort((2 * np.stack([w, x]) - 1) * p.range_max, axis=0)
     return np.column_stack([np.pi * (2 * u - 1), v * p.range_max, *ends])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from decimal import Decimal, localcontext
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,19 +21,21 @@ from gpusense.models.point.base import (
     MISSING,
     PI,
     PointModel,
-    exact,
     log_of,
-    rand_omission,
+    normal_terms,
+    rand_omissions,
     relative_omissions,
     total,
     two_parts,
 )
-from gpusense.models.point.sampling import HEADING, POSITION, draws_at, mounted, standard_normal, von_mises
+from gpusense.models.point.sampling import HEADING, POSITION, draws_at, mounted, standard_normal, von_mises, wrapped
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 
 # Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series; either has few terms there.
 _WIDEST_SUM = 1.5
+# Rows of a covariance matrix.
+_Matrix = tuple[tuple[Any, Any], tuple[Any, Any]]
 
 
 class PositionModel(PointModel):
@@ -70,15 +72,12 @@ class PositionModel(PointModel):
         checks.instance("parameters", parameters, PositionParameters)
         super().__init__(backend, precision, temperature)
         self.parameters = parameters
-        p = parameters
-        matrix = p.covariance
-        self._hit: list[np.floating] | None = None
-        if p.sigma is not None:
-            self._check_scale("sigma", p.sigma)
-            square = exact(p.sigma) * exact(p.sigma)
-            self._hit = self._gaussian("sigma", (square, Decimal(0), square))
-        elif matrix is not None:
-            self._hit = self._gaussian("covariance", (exact(matrix[0][0]), exact(matrix[0][1]), exact(matrix[1][1])))
+        self._hit: list[np.floating] = []
+        if parameters.sigma is not None:
+            square = Decimal(parameters.sigma) ** 2
+            self._hit = self._gaussian("sigma", ((square, 0), (0, square)))
+        elif parameters.covariance is not None:
+            self._hit = self._gaussian("covariance", parameters.covariance)
 
     def log_likelihood(
         self, poses: AnyArray, fix: ArrayLike, covariance: ArrayLike | None = None, *, out: Any = None
@@ -100,24 +99,18 @@ class PositionModel(PointModel):
         """
         on_host = arrays.copied_to_host(fix, self._backend, "fix")
         x, y = (float(value) for value in checks.array("fix", on_host, (2,), finite=False))
-        hit = self._hit
-        if covariance is not None:
-            c = check_covariance("covariance", covariance)
-            hit = self._gaussian("covariance", (exact(c[0][0]), exact(c[0][1]), exact(c[1][1])))
-        if hit is None:
-            raise ValueError("covariance: must be given where the parameters have none, got None")
+        matrix = self._covariance(covariance)
+        hit = self._hit if covariance is None else self._gaussian("covariance", matrix)
         if not (math.isfinite(x) and math.isfinite(y)):
-            return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
+            return self._score(poses, out, None, [MISSING])
         terms = self._terms(hit, x, y)
-        impossible = math.isinf(terms.random)
-        flags = self._flags if impossible else self._flags | {"RAND"}
-        left_out = [rand_omission("the fix is outside the region")] if impossible and self.parameters.z_rand else []
-
-        mount_x, mount_y = self.parameters.mount
-        numbers = dict(origin_x=x, origin_y=y, mount_x=mount_x, mount_y=mount_y)
-        uploads = dict(terms=packed([terms], self._real))
-        program = self._programmer("place_relative", numbers, "score_position", flags, uploads)
-        return cast(np.ndarray, self._score(poses, out, program, left_out))
+        possible = math.isfinite(terms.random)
+        left_out = rand_omissions(possible, "the fix is outside the region") if self.parameters.z_rand else []
+        program = self._programmer(
+            "place_relative", (x, y, *self.parameters.mount), "score_position",
+            self._flags | flags_if(RAND=possible), dict(terms=packed([terms], self._real)),
+        )  # fmt: skip
+        return self._score(poses, out, program, left_out)
 
     def sample(
         self, poses: AnyArray, seed: int = 0, *, step: int = 0, covariance: ArrayLike | None = None
@@ -143,13 +136,7 @@ class PositionModel(PointModel):
             >>> model.sample([(1.0, 2.0, 0.0)] * 3, seed=1).shape
             (3, 2)
         """
-        p = self.parameters
-        matrix = None if covariance is None else check_covariance("covariance", covariance)
-        if matrix is None and p.sigma is not None:
-            matrix = (p.sigma**2, 0.0), (0.0, p.sigma**2)
-        matrix = p.covariance if matrix is None else matrix
-        if matrix is None:
-            raise ValueError("covariance: must be given where the parameters have none, got None")
+        p, matrix = self.parameters, self._covariance(covariance)
         draws = draws_at(poses, self._backend, seed, step)
         (kind, one), (other, _) = draws.uniform(POSITION), draws.uniform(POSITION, 1)
         first, second = standard_normal(one), standard_normal(other)
@@ -166,8 +153,18 @@ class PositionModel(PointModel):
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
-        omissions = [] if p.z_rand else [rand_omission("z_rand = 0")]
-        return "position fix", omissions + relative_omissions(p.mount, self.precision)
+        return "position fix", rand_omissions(p.z_rand) + relative_omissions(p.mount, self.precision)
+
+    def _covariance(self, covariance: ArrayLike | None) -> _Matrix:
+        """Return the covariance matrix of a fix, from the call or the parameters."""
+        p = self.parameters
+        if covariance is not None:
+            return check_covariance("covariance", covariance)
+        if p.sigma is not None:
+            return (p.sigma**2, 0.0), (0.0, p.sigma**2)
+        if p.covariance is None:
+            raise ValueError("covariance: must be given where the parameters have none, got None")
+        return p.covariance
 
     def _terms(self, hit: list[np.floating], x: float, y: float) -> PositionTerms:
         region, random = self.parameters.region, -math.inf
@@ -176,10 +173,10 @@ class PositionModel(PointModel):
             random -= math.log(region[2] - region[0]) + math.log(region[3] - region[1])
         return PositionTerms(random, *hit)
 
-    def _gaussian(self, name: str, covariance: tuple[Decimal, Decimal, Decimal]) -> list[np.floating]:
+    def _gaussian(self, name: str, covariance: _Matrix) -> list[np.floating]:
         """Return the whitening by the Cholesky factor, and the log of weight and peak, each as two numbers."""
         with localcontext(prec=DIGITS):
-            xx, xy, yy = covariance
+            (xx, xy), (_, yy) = (map(Decimal, row) for row in covariance)
             first = xx.sqrt()
             below = xy / first
             second = (yy - below * below).sqrt()
@@ -248,14 +245,13 @@ class HeadingModel(PointModel):
         on_host = arrays.copied_to_host(heading, self._backend, "heading")
         reading = float(checks.array("heading", on_host, (), finite=False))
         if not math.isfinite(reading):
-            return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
+            return self._score(poses, out, None, [MISSING])
         zero = np.zeros(1)
         turned = wrapped_difference(np.array([self.parameters.offset]), (zero, zero))
         high, low = wrapped_difference(np.array([reading]), turned)
-        target = dict(target=float(high[0]), target_low=float(low[0]))
         density = dict(terms=self._terms_buffer, waves=self._waves_buffer, kind=self._kind)
-        program = self._programmer("wrap_headings", target, "score_heading", self._flags, {}, **density)
-        return cast(np.ndarray, self._score(poses, out, program, []))
+        program = self._programmer("wrap_headings", (high[0], low[0]), "score_heading", self._flags, {}, **density)
+        return self._score(poses, out, program, [])
 
     def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:
         """Draw a heading from p(z | x) at each pose, on the host in float64; see ``BeamModel.sample``.
@@ -281,18 +277,16 @@ class HeadingModel(PointModel):
         p, draws = self.parameters, draws_at(poses, self._backend, seed, step)
         kind, u = draws.uniform(HEADING)
         error = von_mises(draws, HEADING, p.kappa) if p.kind == "von_mises" else p.sigma * standard_normal(u)
-        none = (np.zeros(1), np.zeros(1))
-        turned, offset = (wrapped_difference(angle, none)[0] for angle in (draws.poses[:, 2], np.array([p.offset])))
-        total = wrapped_difference(turned + (offset + error), none)[0]
+        turned = wrapped(wrapped(draws.poses[:, 2]) + (wrapped(np.array([p.offset])) + error))
         hit = kind * (p.z_hit + p.z_rand) < p.z_hit
-        return draws.reshaped(np.where(hit, total, math.pi * (2 * u - 1)))
+        return draws.reshaped(np.where(hit, turned, math.pi * (2 * u - 1)))
 
     def _options(self) -> tuple[str, ...]:
         return (f"kind={self.parameters.kind!r}",)
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
-        omissions = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        omissions = rand_omissions(p.z_rand)
         # Distance from half a turn beyond which the other turns are below exp(-40) of the nearest turn.
         near = NEGLIGIBLE * p.sigma**2 / (2 * math.pi)
         if self._kind == NEARBY and near < math.pi:
@@ -311,12 +305,11 @@ class HeadingModel(PointModel):
 
                 # A small kappa may underflow; its density then equals that of kappa = 0.
                 self._check_scale("kappa", 1 / math.sqrt(max(p.kappa, 1.0)), "1 / sqrt(kappa) ")
-                kind, scale = VON_MISES, (2 * exact(p.kappa)).sqrt()
-                peak = total(log_hit, -(2 * PI * exact(float(i0e(p.kappa)))).ln())
+                kind, scale = VON_MISES, (2 * Decimal(p.kappa)).sqrt()
+                peak = total(log_hit, -(2 * PI * Decimal(float(i0e(p.kappa)))).ln())
             elif p.sigma <= _WIDEST_SUM:
                 self._check_scale("sigma", p.sigma)
-                kind, scale = NEARBY, 1 / (Decimal(2).sqrt() * exact(p.sigma))
-                peak = total(log_hit, -((2 * PI).sqrt() * exact(p.sigma)).ln())
+                kind, (scale, peak) = NEARBY, normal_terms(p.sigma, log_hit)
                 # Clamped to stay finite in float32; other turns vanish long before.
                 decay = min(2 * math.pi / p.sigma / p.sigma, 1e30)
             else:

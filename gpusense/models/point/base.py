@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from decimal import Decimal, localcontext
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, flags_of, launch
-from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
+from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan, share
 from gpusense.models.arguments import Pickled, real_dtype
 from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
 from gpusense.models.poses import Part, Poses, pose_status
@@ -28,27 +28,35 @@ from gpusense.reference import relative
 
 Programmer = Callable[[Poses, Part, Buffer], Program]
 """Function that makes the program that writes log p of some poses into a buffer."""
-# By the kernel of the file ``relative``: the name of its result, and numbers for each pose.
-_PLACED = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}
-ORIGIN = dict(origin_x=0.0, origin_y=0.0, mount_x=0.0, mount_y=0.0)
+# By the kernel of the file ``relative``: the name of its result, numbers for each pose, and the names of its numbers.
+_PLACED = {
+    "place_relative": ("place", 4, ("origin_x", "origin_y", "mount_x", "mount_y")),
+    "wrap_headings": ("residual", 2, ("target", "target_low")),
+}
 MISSING = Omission("reading", "it is not finite, so it is missing", "everything but a look at the poses")
 
 
-def rand_omission(why: str, each: str = "") -> Omission:
-    """Return the omission of the uniform component of a mixture."""
-    return Omission("rand component", why, f"1 exp and 1 log per particle{each}")
+def rand_omissions(z_rand: float, why: str = "z_rand = 0", *, per: str = "particle") -> list[Omission]:
+    """Return the omission of the uniform component of a mixture, unless its weight is positive."""
+    return [] if z_rand else [Omission("rand component", why, f"1 exp and 1 log per {per}")]
+
+
+def float64_omissions(precision: str, why: str, saved: str = "half the bytes and wide units") -> list[Omission]:
+    """Return the omission of float64 in float32."""
+    return [Omission("float64", why, saved)] if precision == "float32" else []
 
 
 def relative_omissions(mount: tuple[float, float], precision: str) -> list[Omission]:
     """Return the omissions of places relative to a fix or to beacons."""
-    omissions = []
-    if mount == (0.0, 0.0):
-        why = "the antenna sits at the robot's origin"
-        omissions.append(Omission("mount", why, "cosine and sine of a heading, and a rotation, per particle"))
-    if precision == "float32":
-        why = "places are taken relative to what is measured in float64, and kept in two numbers"
-        omissions.append(Omission("float64", why, "half the bytes and wide units"))
-    return omissions
+    saved = "cosine and sine of a heading, and a rotation, per particle"
+    omissions = [Omission("mount", "the antenna sits at the robot's origin", saved)] if mount == (0.0, 0.0) else []
+    why = "places are taken relative to what is measured in float64, and kept in two numbers"
+    return omissions + float64_omissions(precision, why)
+
+
+def counted_omissions(what: str, number: int, total: int, why: str, of: str) -> list[Omission]:
+    """Return the omission of a number of readings, unless it is 0; ``of`` names the total."""
+    return [Omission(what, f"{number} of {total} {why}", f"{share(number, total)} of {of}")] if number else []
 
 
 class PointModel(Pickled):
@@ -112,7 +120,7 @@ class PointModel(Pickled):
         items: int = 1,
         itemsize: float = 0,
         after: Callable[[Part], None] = lambda part: None,
-    ) -> Any:
+    ) -> np.ndarray:
         """Return log p of each pose, computed in parts; 0 without a program.
 
         ``items``: cost of a pose, in readings of a scan; ``itemsize``: bytes that are kept for each pose and item;
@@ -127,7 +135,7 @@ class PointModel(Pickled):
             log_p = PartialResult(space, "log_p", result.flat, piece.begin, piece.count, real)
             if program is None:
                 # Poses that are not finite are refused even without a measurement.
-                _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)
+                _, launches = self._relative(checked, piece.part, "place_relative", (0.0,) * 4)
                 backend.run(launches)
                 backend.upload(np.zeros(piece.count, real), log_p.buffer)
             else:
@@ -144,10 +152,10 @@ class PointModel(Pickled):
             else:
                 run_pieces(space, Piece(0, count, count), chunk_of(backend, items, itemsize), score)
             finish(space, on_device)
-        return result.user_array()
+        return cast(np.ndarray, result.user_array())
 
     def _programmer(
-        self, place: str, numbers: dict[str, float], kernel: str, flags: frozenset[str], uploads: dict[str, np.ndarray],
+        self, place: str, numbers: Sequence[float], kernel: str, flags: frozenset[str], uploads: dict[str, np.ndarray],
         **arguments: Any,
     ) -> Programmer:  # fmt: skip
         """Return the function that makes the program of a kernel that scores places or residuals; see ``_relative``.
@@ -168,21 +176,22 @@ class PointModel(Pickled):
 
         return program
 
-    def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
+    def _relative(self, poses: Poses, part: Part, kernel: str, numbers: Sequence[float]) -> tuple[Buffer, Program]:
         """Return places or residuals of some poses, and the launch of the kernel that computes them."""
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
-        name, width = _PLACED[kernel]
+        name, width, names = _PLACED[kernel]
         poses.corners(part, backend, space)
         flags, source = poses.flags, poses.buffer(backend, space, part)
         if source is None:
             assert poses.host is not None
             placed = np.empty((count, width), self._real)
             body = getattr(relative, kernel)
-            body(frozenset(), poses.host[slice(*part)], placed, np.zeros(2, np.int32), *numbers.values(), count)
+            body(frozenset(), poses.host[slice(*part)], placed, np.zeros(2, np.int32), *numbers, count)
             return space.upload(kernel, placed), ()
         result = space.empty(kernel, width * count, self._real)
         arguments = {"poses": source, name: result, "pose_status": pose_status(space), "particles": count}
-        return result, (launch(kernel, self._flags | flags, (count,), **arguments, **numbers),)
+        arguments |= zip(names, numbers, strict=True)
+        return result, (launch(kernel, self._flags | flags, (count,), **arguments),)
 
 
 # ---- arguments of kernels to twice a model's precision: computed with 50 digits, split into high and low parts
@@ -190,11 +199,6 @@ class PointModel(Pickled):
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937511")
 DIGITS = 50
-
-
-def exact(value: float) -> Decimal:
-    """Return a float without rounding."""
-    return Decimal(value)
 
 
 def log_of(value: Decimal | float) -> Decimal | float:
@@ -207,6 +211,13 @@ def total(*values: Decimal | float) -> Decimal | float:
     """Return a sum of logarithms; -inf if any term is -inf."""
     with localcontext(prec=DIGITS):
         return sum((Decimal(v) for v in values), Decimal(0)) if all(map(math.isfinite, values)) else -math.inf
+
+
+def normal_terms(sigma: float, log_weight: Decimal | float) -> tuple[Decimal, Decimal | float]:
+    """Return ``1 / (sigma sqrt 2)``, and the log of a weight times a normal's peak."""
+    with localcontext(prec=DIGITS):
+        scale = 1 / (Decimal(2).sqrt() * Decimal(sigma))
+        return scale, total(log_weight, -((2 * PI).sqrt() * Decimal(sigma)).ln())
 
 
 def two_parts(values: Iterable[Decimal | float], real: np.dtype) -> list[np.floating]:

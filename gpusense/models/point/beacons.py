@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from decimal import Decimal, localcontext
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,15 +14,16 @@ from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
 from gpusense.interface.constants import BEACON, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
 from gpusense.interface.flags import flags_if
-from gpusense.interface.plan import Omission, share
+from gpusense.interface.plan import Omission
 from gpusense.interface.structs import BeaconTerms, packed
 from gpusense.models.point.base import (
     DIGITS,
     PI,
     PointModel,
-    exact,
+    counted_omissions,
     log_of,
-    rand_omission,
+    normal_terms,
+    rand_omissions,
     relative_omissions,
     total,
     two_parts,
@@ -86,10 +87,8 @@ class BeaconModel(PointModel):
             raise ValueError(f"xy: must be within {FARTHEST:.2g} m of the middle, got {far:.2g} m")
         self._kind, terms, series = self._mixture()
         self._count = len(series)
-        self._terms_buffer, self._series_buffer = (
-            self._backend.upload(packed([terms], self._real)),
-            self._backend.upload(series),
-        )
+        self._terms_buffer = self._backend.upload(packed([terms], self._real))
+        self._series_buffer = self._backend.upload(series)
 
     def log_likelihood(
         self, poses: AnyArray, ranges: ArrayLike, ids: ArrayLike | None = None, *, out: Any = None
@@ -113,15 +112,13 @@ class BeaconModel(PointModel):
         beacon, left_out = self._prepare(ranges, ids)
         count = len(beacon)
         if count == 0:
-            return cast(np.ndarray, self._score(poses, out, None, left_out))
-
-        (origin_x, origin_y), (mount_x, mount_y) = self._origin, self.parameters.mount
+            return self._score(poses, out, None, left_out)
         program = self._programmer(
-            "place_relative", dict(origin_x=origin_x, origin_y=origin_y, mount_x=mount_x, mount_y=mount_y),
-            "score_beacons", self._flags, dict(beacon=beacon), terms=self._terms_buffer, series=self._series_buffer,
-            beacons=count, count=self._count, kind=self._kind,
+            "place_relative", (*self._origin, *self.parameters.mount), "score_beacons", self._flags,
+            dict(beacon=beacon), terms=self._terms_buffer, series=self._series_buffer, beacons=count,
+            count=self._count, kind=self._kind,
         )  # fmt: skip
-        return cast(np.ndarray, self._score(poses, out, program, left_out, items=count))
+        return self._score(poses, out, program, left_out, items=count)
 
     def _arguments(self) -> dict[str, Any]:
         return super()._arguments() | {"xy": self.xy}
@@ -177,23 +174,17 @@ class BeaconModel(PointModel):
 
     def _indices(self, ids: object) -> np.ndarray:
         """Return the (F,) indices of beacons."""
-        known = len(self.xy)
         if ids is None:
-            return np.arange(known)
+            return np.arange(len(self.xy))
         chosen = checks.as_array("ids", ids)
-        index = checks.array("ids", chosen.astype(np.int64) if chosen.size == 0 else chosen, ("F",), dtype=np.int64)
-        outside = (index < 0) | (index >= known)
-        if outside.any():
-            at = int(np.argmax(outside))
-            raise ValueError(f"ids: indices must be in [0, {known}), got {index[at]} at index {at}")
-        return index
+        return checks.indices("ids", chosen if chosen.size else chosen.astype(np.int64), len(self.xy), ("F",))
 
     def _options(self) -> tuple[str, ...]:
         return f"beacons={len(self.xy)}", f"kind={self.parameters.kind!r}"
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
-        omissions = [] if p.z_rand else [rand_omission("z_rand = 0", " and range")]
+        omissions = rand_omissions(p.z_rand, per="particle and range")
         return f"ranges to beacons, {p.kind}", omissions + relative_omissions(p.mount, self.precision)
 
     def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
@@ -203,20 +194,16 @@ class BeaconModel(PointModel):
         index = self._indices(ids)
         z = checks.array("ranges", on_host, (len(index),), finite=False)
         missing, valid = np.isnan(z), (z >= 0) & (z <= p.range_max)
-        left_out = []
-        reasons = (
+        left_out, rows, used = [], [], index[valid]
+        for what, which, why in (
             ("missing ranges", missing, "are nan"),
             ("impossible ranges", ~(missing | valid), f"are not in [0, {p.range_max:g}] m"),
-        )
-        for what, which, why in reasons:
-            if number := int(np.count_nonzero(which)):
-                why = f"{number} of {len(z)} {why}"
-                left_out.append(Omission(what, why, f"{share(number, len(z))} of the ranges"))
-        rows, used = [], index[valid]
+        ):
+            left_out += counted_omissions(what, int(np.count_nonzero(which)), len(z), why, "the ranges")
         with localcontext(prec=DIGITS):
             for (x, y), reading, bias in zip(self.xy[used], z[valid], self._bias[used], strict=True):
-                numbers = (exact(float(x)) - exact(self._origin[0]), exact(float(y)) - exact(self._origin[1]),
-                           exact(float(reading)) - exact(float(bias)))  # fmt: skip
+                pairs = (x, self._origin[0]), (y, self._origin[1]), (reading, bias)
+                numbers = (Decimal(float(one)) - Decimal(float(other)) for one, other in pairs)
                 rows.append([*two_parts(numbers, self._real), self._real.type(bias)])
         return np.array(rows, self._real).reshape(-1, BEACON), left_out
 
@@ -232,36 +219,23 @@ class BeaconModel(PointModel):
         with localcontext(prec=DIGITS):
             if p.kind == "student_t":
                 kind, nu = STUDENT_T, Decimal(p.nu)
-                log_peak = _log_t_peak(p.nu) - exact(p.sigma_range).ln()
+                log_peak = _log_t_peak(p.nu) - Decimal(p.sigma_range).ln()
                 k = (2 * log_peak / (nu + 1)).exp()
-                first = two_parts((1 / (exact(p.sigma_range) * (nu * k).sqrt()), log_of(p.z_hit)), real)
+                first = two_parts((1 / (Decimal(p.sigma_range) * (nu * k).sqrt()), log_of(p.z_hit)), real)
+                rest = dict(zip(("offset", "offset_low"), two_parts((1 / k,), real), strict=True))
                 arc, series = t_series(p.nu)
                 flat = 1 / (p.sigma_range * math.sqrt(p.nu))
-                offset, offset_low = two_parts((1 / k,), real)
-                rest = dict(
-                    offset=offset,
-                    offset_low=offset_low,
-                    power=(p.nu + 1) / 2,
-                    t_scale=flat,
-                    arc=arc,
-                    odd=float(p.nu % 2),
-                )
+                rest |= dict(power=(p.nu + 1) / 2, t_scale=flat, arc=arc, odd=float(p.nu % 2))
             else:
                 kind, share = NORMAL, 1.0
                 if p.kind == "mixture":
                     self._check_scale("sigma_heavy", p.sigma_heavy)
                     kind, share = TWO_NORMALS, 1 - p.heavy_weight
-                    heavy = _normal(p.sigma_heavy, total(log_of(p.z_hit), log_of(p.heavy_weight)))
+                    heavy = normal_terms(p.sigma_heavy, total(log_of(p.z_hit), log_of(p.heavy_weight)))
                     names = ("wide_scale", "wide_scale_low", "wide_peak", "wide_peak_low")
                     rest = dict(zip(names, two_parts(heavy, real), strict=True))
-                first = two_parts(_normal(p.sigma_range, total(log_of(p.z_hit), log_of(share))), real)
+                first = two_parts(normal_terms(p.sigma_range, total(log_of(p.z_hit), log_of(share))), real)
         return kind, BeaconTerms(random, p.range_max, *first, **rest), series.astype(real)
-
-
-def _normal(sigma: float, log_share: Decimal | float) -> tuple[Decimal, Decimal | float]:
-    """Return ``1 / (sigma sqrt 2)`` and the log of a share of a normal's peak."""
-    scale = 1 / (Decimal(2).sqrt() * exact(sigma))
-    return scale, total(log_share, -((2 * PI).sqrt() * exact(sigma)).ln())
 
 
 def _log_t_peak(nu: int) -> Decimal:

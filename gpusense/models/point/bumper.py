@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from decimal import localcontext
+from decimal import Decimal, localcontext
 from typing import Any, cast
 
 import numpy as np
@@ -13,14 +13,14 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Precision, Space
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
-from gpusense.interface.constants import FIELD_RING
+from gpusense.interface.constants import FIELD_RING, log_weight
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.interface.plan import Omission, share
+from gpusense.interface.plan import Omission
 from gpusense.interface.structs import ContactTerms, packed
 from gpusense.models.arguments import map_words
-from gpusense.models.point.base import DIGITS, PointModel, exact, two_parts
+from gpusense.models.point.base import DIGITS, PointModel, counted_omissions, float64_omissions, two_parts
 from gpusense.models.point.sampling import BUMPER, draws_at
 from gpusense.models.poses import Part, Poses, place
 from gpusense.tables.distances import squared_distances
@@ -108,8 +108,7 @@ class BumperModel(PointModel):
         self._table = squared_distances(self._backend, obstacles)
         self._window = Window(-margin, -margin, rows, cols)
         self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
-        high, low = split(self._points / side, self._real)
-        self._all_points = [self._backend.upload(each) for each in (high, low)]
+        self._all_points = self._uploaded(self._points)
         self._terms_buffer = self._backend.upload(packed([self._terms(self._radius)], self._real))
 
     def log_likelihood(self, poses: AnyArray, pressed: ArrayLike, *, out: Any = None) -> np.ndarray:
@@ -128,18 +127,14 @@ class BumperModel(PointModel):
             ValueError: A wrong shape, or a pose that is not finite.
         """
         states = self._states(pressed)
-        valid, left_out = states >= 0, []
-        if missing := int(np.count_nonzero(~valid)):
-            why = f"{missing} of {self.segments} are nan or None"
-            left_out = [Omission("missing readings", why, f"{share(missing, self.segments)} of the segments")]
+        valid = states >= 0
+        missing = int(np.count_nonzero(~valid))
+        left_out = counted_omissions("missing readings", missing, self.segments, "are nan or None", "the segments")
         if not valid.any():
-            return cast(np.ndarray, self._score(poses, out, None, left_out))
+            return self._score(poses, out, None, left_out)
         sizes = np.diff(self._start)
         kept = np.repeat(valid, sizes)
-        points = self._all_points
-        if not kept.all():
-            chosen = split(self._points[kept] / self.grid.resolution, self._real)
-            points = [self._backend.upload(each) for each in chosen]
+        points = self._uploaded(self._points[kept]) if missing else self._all_points
         start = np.concatenate([[0], np.cumsum(sizes[valid])]).astype(np.int32)
         known = states[valid].astype(np.int32)
         flags = self._flags | flags_if(TWO_PART_POINTS=self._real == np.float32)
@@ -158,7 +153,7 @@ class BumperModel(PointModel):
             )  # fmt: skip
             return (*placed.launches(), score)
 
-        return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
+        return self._score(poses, out, program, left_out, items=int(kept.sum()))
 
     def _arguments(self) -> dict[str, Any]:
         options = dict(
@@ -190,7 +185,10 @@ class BumperModel(PointModel):
         """
         draws = draws_at(poses, self._backend, seed, step)
         # Probabilities from a single backend and precision, so that all backends draw the same readings.
-        model = self if self.device.backend == "numpy" and self._real == np.float64 else self._on_host()
+        model = self
+        if self.device.backend != "numpy" or self._real != np.float64:
+            on_host = dict(backend="numpy", precision="float64", temperature=1.0)
+            model = BumperModel(**self._arguments() | on_host)
         pressed = np.empty((len(draws.poses), self.segments), bool)
         for segment in range(self.segments):
             states: list[float] = [math.nan] * self.segments
@@ -198,13 +196,6 @@ class BumperModel(PointModel):
             log_p = model.log_likelihood(draws.poses, states)
             pressed[:, segment] = draws.uniform(BUMPER + segment)[0] < np.exp(log_p / model.temperature)
         return draws.reshaped(pressed[:, 0] if self._single else pressed)
-
-    def _on_host(self) -> BumperModel:
-        """Return the same model of NumPy in float64."""
-        return BumperModel(
-            self.grid, self._outline, self.parameters, segments=self._segments, backend="numpy", precision="float64",
-            unknown=self.unknown, outside=self.outside,
-        )  # fmt: skip
 
     def _options(self) -> tuple[str, ...]:
         return map_words(self.grid), f"segments={self.segments}"
@@ -217,10 +208,12 @@ class BumperModel(PointModel):
             omissions.append(Omission("points of the outline", why, f"about {spared} look-ups per particle"))
         why = f"unknown cells are {self.unknown} by one rule, applied once to the map"
         omissions.append(Omission("unknown branch", why, "a test per look-up"))
-        if self.precision == "float32":
-            why = "positions are split into cell and fraction in float64"
-            omissions.append(Omission("float64", why, "half the bytes and wide units"))
-        return "bumper", omissions
+        why = "positions are split into cell and fraction in float64"
+        return "bumper", omissions + float64_omissions(self.precision, why)
+
+    def _uploaded(self, points: np.ndarray) -> list[Buffer]:
+        """Return buffers of the outline's points in cells, and of their rounding errors (low parts)."""
+        return [self._backend.upload(each) for each in split(points / self.grid.resolution, self._real)]
 
     def _states(self, pressed: object) -> np.ndarray:
         """Return (B,) states: 1 pressed, 0 released, -1 missing."""
@@ -248,12 +241,11 @@ class BumperModel(PointModel):
         """Return the numbers of the kernel file ``contact``."""
         p, side = self.parameters, self.grid.resolution
         with localcontext(prec=DIGITS):
-            scale = 1 / (exact(2).sqrt() * exact(p.sigma))
-            pairs = two_parts((scale, exact(radius) + exact(side) / 2, exact(side)), self._real)
+            scale = 1 / (Decimal(2).sqrt() * Decimal(p.sigma))
+            pairs = two_parts((scale, Decimal(radius) + Decimal(side) / 2, Decimal(side)), self._real)
         weights = (p.p_contact, p.p_false)
-        logs = [math.log(w) if w > 0 else -math.inf for w in weights]
         misses = [math.log1p(-w) if w < 1 else -math.inf for w in weights]
-        return ContactTerms(*pairs, *logs, *misses)
+        return ContactTerms(*pairs, *map(log_weight, weights), *misses)
 
 
 def _kept(value: Any) -> Any:

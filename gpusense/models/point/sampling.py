@@ -20,6 +20,7 @@ from gpusense.backends import arrays
 from gpusense.backends.base import Backend
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.philox import random_words
+from gpusense.reference.relative import wrapped_difference
 from gpusense.reference.sampling import fine_uniform
 
 Distribution = Callable[[Floats], Floats]
@@ -62,6 +63,12 @@ def draws_at(poses: Any, backend: Backend, seed: object, step: object) -> Draws:
     shape = host.shape[:-1]
     scan, particle = np.indices(shape) if several else (np.zeros(shape, np.int64), np.arange(shape[0]))
     return Draws(host.reshape(-1, 3), shape, particle.ravel(), scan.ravel() + first, (key & 0xFFFFFFFF, key >> 32))
+
+
+def wrapped(angle: Floats) -> Floats:
+    """Return angles of any number of turns in [-pi, pi]."""
+    none = np.zeros(1)
+    return np.asarray(wrapped_difference(angle, (none, none))[0])
 
 
 def standard_normal(u: Floats) -> Floats:

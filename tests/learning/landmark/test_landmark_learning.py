@@ -215,8 +215,8 @@ POSES, FEATURES = np.zeros((2, 3)), [[2.0, 1.0], [5.0, 0.9]]
     [
         ({"features": [[1, 0], [21, 0]]}, ValueError,
          "features: range must be in [0, 20] (range_max), got 21.0 at index 1"),
-        ({"correspondence": [0, 2]}, ValueError, "correspondence: indices must be in [-1, 2), got 2 at index 1"),
-        ({"scan": [0, 2]}, ValueError, "scan: indices must be in [0, 2), got 2 at index 1"),
+        ({"correspondence": [0, 2]}, ValueError, "correspondence: every index must be in [-1, 2), got 2 at index 1"),
+        ({"scan": [0, 2]}, ValueError, "scan: every index must be in [0, 2), got 2 at index 1"),
     ],
     ids=str,
 )  # fmt: skip

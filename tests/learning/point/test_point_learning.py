@@ -250,7 +250,7 @@ V, T = ValueError, TypeError
 def test_bad_input_is_refused(refuses: Any) -> None:
     fit, poses = gs.fit_beacon_parameters, POSES
     refuses(V, "ranges: shape must be (400, 3), got (400, 2)", fit, poses, RANGES[:, :2], XY)
-    refuses(V, "ids: indices must be in [0, 3), got 3 at index 1", fit, poses[:2], [1, 2], XY, ids=[0, 3])
+    refuses(V, "ids: every index must be in [0, 3), got 3 at index 1", fit, poses[:2], [1, 2], XY, ids=[0, 3])
     refuses(V, "ranges: must hold one in [0, 100] m, got 1200 without", fit, poses, RANGES * NAN, XY)
     refuses(V, "bias: must be one of 'none', 'common', 'each', got 'one'", fit, poses, RANGES, XY, bias="one")
     refuses(V, "blocks: must be at least 2 with a reading that is not missing, got 1", fit, poses, RANGES, XY,

@@ -182,7 +182,7 @@ def test_false_positives_fill_the_limits():
     for feature in (z[:, 0], z[:, 1]):
         for part, low, length in zip(feature.T, (0.0, -1.5, 1 - 1.2), (6.0, 3.0, 2 + 2.4), strict=True):
             assert stats.kstest(part, "uniform", args=(low, length)).pvalue > FALSE_ALARM
-    with pytest.raises(ValueError, match=r"correspondence: indices must be in \[-1, 3\), got 3"):
+    with pytest.raises(ValueError, match=r"correspondence: every index must be in \[-1, 3\), got 3"):
         gs.LandmarkModel(MAP, p, backend="numpy").sample([POSE], correspondence=[3])
 
 
@@ -195,5 +195,5 @@ def test_parts_without_a_deviation_are_not_measured():
 def test_beacons_by_index_and_their_errors():
     model = models()["beacons"]
     assert model.sample([POSE], ids=[1, 1, 0]).shape == (1, 3) and model.sample([POSE], ids=[]).shape == (1, 0)
-    with pytest.raises(ValueError, match=r"ids: indices must be in \[0, 2\), got 2"):
+    with pytest.raises(ValueError, match=r"ids: every index must be in \[0, 2\), got 2"):
         model.sample([POSE], ids=[2])

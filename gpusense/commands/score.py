@@ -140,6 +140,6 @@ def _fitness(fitness: Fitness, pose: str) -> str:
     return f"WRONG MAP: {share}; {fitness.evidence.text}; is this the map of the log, and are its poses on the map?"
 
 
-def number_text(value: float | None, absent: str = "-") -> str:
-    """Return a number with four digits, or ``absent`` for None."""
-    return absent if value is None else f"{value:.4g}"
+def number_text(value: float | None) -> str:
+    """Return a number with four digits, "-" for None."""
+    return "-" if value is None else f"{value:.4g}"

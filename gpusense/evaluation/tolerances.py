@@ -51,11 +51,11 @@ class Tolerance:
         if a.shape != b.shape:
             return math.inf
         with np.errstate(all="ignore"):
-            apart = np.abs(a - b) / self._size(np.abs(b))
+            apart = np.abs(a - b) / self.sizes(np.abs(b))
         apart = np.where(np.isnan(apart) | (np.isinf(a) != np.isinf(b)), np.inf, apart)
         return float(np.max(np.where(a == b, 0.0, apart), initial=0.0))
 
-    def _size(self, size: Reals) -> Reals:
+    def sizes(self, size: Reals) -> Reals:
         """Return the tolerance's unit at each magnitude."""
         if self.unit == "relative":
             return size
@@ -183,10 +183,8 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
 
 def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Reals:
     """Return the largest error allowed of each beam's log-likelihood [nats]; infinite ones must be exact."""
-    tolerance = beam_tolerance(dtype)
-    scale = tolerance.value * (_EPS if tolerance.unit.startswith("eps") else 1.0)
-    size = np.abs(np.asarray(log_p, np.float64))
-    return np.where(np.isfinite(size), scale * (1 + size), 0.0)
+    tolerance, size = beam_tolerance(dtype), np.abs(np.asarray(log_p, np.float64))
+    return np.where(np.isfinite(size), tolerance.value * tolerance.sizes(size), 0.0)
 
 
 def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperature: float = 1.0) -> Reals:

@@ -58,18 +58,6 @@ class Call:
         return len(self.prepared.columns)
 
 
-def known_features(
-    prepared: PreparedFeatures, partner: np.ndarray, buckets: Buckets
-) -> tuple[PreparedFeatures, np.ndarray, float]:
-    """Return the features with a landmark, their landmarks' places, and the constant term of the false positives."""
-    known = partner >= 0
-    constant = float(prepared.false[prepared.columns[~known]].sum())
-    features = PreparedFeatures(
-        prepared.columns[known], prepared.numbers[known], prepared.measured[known], prepared.false
-    )
-    return features, buckets.place_of[partner[known]], constant
-
-
 class FeatureModel(PointModel):
     """Base of the models of features: each belongs to a landmark or line of the map, or is a false positive.
 
@@ -81,6 +69,8 @@ class FeatureModel(PointModel):
     _angles: ClassVar[tuple[int, str]]
     _buckets: Buckets
     _tables: LandmarkTables
+    # Whether launches after the score need the landmark of each feature.
+    _negative = False
 
     def __init__(
         self, name: str, count: int, backend: Selection, precision: str, *, association: Association,
@@ -155,10 +145,6 @@ class FeatureModel(PointModel):
     def _code(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
         """Return the flags of the kernels."""
 
-    def _needs_partners(self) -> bool:
-        """Return whether launches after the score need the landmark of each feature."""
-        return False
-
     def _after(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Program:
         return ()
 
@@ -170,11 +156,13 @@ class FeatureModel(PointModel):
         joint = not known and self.association == "joint"
         if known:
             partner = check_correspondence(correspondence, len(full), self._count)[prepared.columns]
-            prepared, places, fixed = known_features(prepared, partner, self._buckets)
+            real = partner >= 0
+            fixed = float(prepared.false[prepared.columns[~real]].sum())
+            prepared, places = prepared.chosen(real), self._buckets.place_of[partner[real]]
         elif joint and len(prepared.columns) > JOINT_FEATURES:
             got = len(prepared.columns)
             raise ValueError(f"features: must be at most {JOINT_FEATURES} with association='joint', got {got}")
-        return Call(prepared, places, fixed, self._code(prepared, known, each or self._needs_partners()), joint)
+        return Call(prepared, places, fixed, self._code(prepared, known, each or self._negative), joint)
 
     def _evaluate(
         self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -107,32 +107,30 @@ def check_correspondence(correspondence: object, count: int, landmarks: int) -> 
     return checks.indices("correspondence", correspondence, landmarks, (count,), low=-1)
 
 
-@dataclass(frozen=True)
-class Reach:
-    """Bounds of the landmarks that can matter to a feature."""
+def _disc_of(
+    p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float
+) -> tuple[float, float, float]:
+    """Return the disc outside which exponents are larger than ``bound``; ``z``: the range, where it was measured.
 
-    reach: float  # distance of the disc's centre along the bearing [m]
-    radius: float  # radius of the disc [m]; negative where no landmark matters
-    hole: float  # least distance from the sensor [m]
-
-
-def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
-    """Return the disc outside which exponents are larger than ``bound``; ``z``: the range, where it was measured."""
+    Returns:
+        Distance of its centre along the bearing; its radius, negative where no landmark matters; and the least distance
+        from the sensor [m].
+    """
     if bound < 0:
-        return Reach(0.0, -1.0, 0.0)
+        return 0.0, -1.0, 0.0
     wide = math.sqrt(bound)
     near, far = 0.0, p.range_max
     if measured[0]:
         near, far = max(z - wide / sensor.scales[0], 0.0), z + wide / sensor.scales[0]
     elif not measured[1]:
-        return Reach(0.0, far, 0.0)
+        return 0.0, far, 0.0
     angle = min(wide / sensor.scales[1], math.pi) if measured[1] else math.pi
-    around = Reach(0.0, far, near)
+    around = 0.0, far, near
     if not measured[1]:
         return around
     if math.isinf(far):
         # All landmarks may matter until one is likelier than every landmark beyond some distance.
-        return Reach(z, far, 0.0)
+        return z, far, 0.0
     # A corner is the point of a ring's sector farthest from its middle.
     if measured[0]:
         ahead = z
@@ -142,7 +140,7 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
     radius = math.sqrt(max(max(ahead**2 + d**2 - 2 * ahead * d * cosine for d in (near, far)), 0.0))
     if not measured[0]:
         radius = max(radius, abs(far - ahead))
-    return Reach(ahead, radius, near) if radius < far else around
+    return (ahead, radius, near) if radius < far else around
 
 
 @dataclass(frozen=True)
@@ -153,6 +151,10 @@ class PreparedFeatures:
     numbers: np.ndarray  # (K, FEATURE) in the model's precision; see ``gpusense.reference.landmarks``
     measured: np.ndarray  # (K, 3) whether range, bearing and signature were measured
     false: np.ndarray  # (F,) float64 log densities of each feature as a false positive; 0 where nothing was measured
+
+    def chosen(self, which: np.ndarray) -> PreparedFeatures:
+        """Return the evaluated features that a mask (K,) selects."""
+        return replace(self, **{name: getattr(self, name)[which] for name in ("columns", "numbers", "measured")})
 
     @property
     def radius(self) -> np.ndarray:
@@ -222,9 +224,9 @@ def _set_reaches(
     # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
     numbers[:, at.SLACK] = 101 * slack**2
     for row, distance, known, bound in zip(numbers, distances.tolist(), measured, bounds.tolist(), strict=True):
-        reach = reach_of(p, sensor, distance, known, bound)
-        radius = reach.radius if reach.radius < 0 else reach.radius * (1 + _WIDER) + slack
-        row[at.REACH : at.HOLE + 1] = reach.reach, radius, max(reach.hole * (1 - _WIDER) - slack, 0.0)
+        reach, radius, hole = _disc_of(p, sensor, distance, known, bound)
+        radius = radius if radius < 0 else radius * (1 + _WIDER) + slack
+        row[at.REACH : at.HOLE + 1] = reach, radius, max(hole * (1 - _WIDER) - slack, 0.0)
 
 
 def in_two_parts(numbers: np.ndarray, real: np.dtype, low_parts: Sequence[tuple[int, int]]) -> np.ndarray:
@@ -305,12 +307,11 @@ _SPREAD = 4.0
 class Sensor:
     """Constants of a sensor and its map, in float64."""
 
-    # 1 / (sigma sqrt 2) of range, bearing and signature; 0 for a part that is left out.
-    scales: tuple[float, float, float]
-    peaks: tuple[float, float, float]  # logarithms of the components' largest densities, before the mass is divided out
-    # Logarithms of the least mass of each, including a bearing's on a full circle.
-    least_masses: tuple[float, float, float]
-    uniforms: tuple[float, float, float]  # logarithms of the uniform densities of range, bearing and signature
+    # All of range, bearing and signature: 1 / (sigma sqrt 2), 0 for a part that is left out.
+    scales: tuple[float, ...]
+    peaks: tuple[float, ...]  # logarithms of the largest densities, before the mass is divided out
+    least_masses: tuple[float, ...]  # logarithms of the least mass, including a bearing's on a full circle
+    uniforms: tuple[float, ...]  # logarithms of the uniform densities
     span: tuple[float, float]  # the smallest and largest signature
 
 
@@ -347,12 +348,7 @@ def describe(p: LandmarkParameters, landmarks: LandmarkMap) -> Sensor:
         masses[1] = math.erf(math.pi * scales[1])
     least = tuple(math.log(mass) if mass > 0 else 0.0 for mass in masses)
     uniforms = tuple(-math.log(length) for length in lengths)
-    return Sensor(_three(scales), _three(peaks), _three(least), _three(uniforms), span)
-
-
-def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
-    first, second, third = values
-    return first, second, third
+    return Sensor(scales, peaks, least, uniforms, span)
 
 
 def full_circle(p: LandmarkParameters) -> bool:

@@ -88,7 +88,7 @@ class LandmarkModel(FeatureModel):
         p = self.parameters
         if p.sigma_signature is not None and landmarks.signatures is None:
             raise ValueError(f"sigma_signature: must be None for a map without signatures, got {p.sigma_signature}")
-        self.negative = checks.boolean("negative", negative)
+        self.negative = self._negative = checks.boolean("negative", negative)
         if negative and checks.choice("association", association, ("nearest", "sum", "joint")) == "sum":
             raise ValueError("association: must be 'nearest' or 'joint' with negative=True, got 'sum'")
         super().__init__(
@@ -194,9 +194,6 @@ class LandmarkModel(FeatureModel):
             RANGE=with_range, BEARING=with_bearing, SIGNATURE=with_signature, FIELD=not full_circle(self.parameters),
             KNOWN=known, MARGINAL=not known and self.association == "sum", PER_BEAM=each,
         )  # fmt: skip
-
-    def _needs_partners(self) -> bool:
-        return self.negative
 
     def _after(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Program:
         """Return the launch that adds the landmarks in view without a feature."""

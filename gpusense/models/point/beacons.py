@@ -29,6 +29,7 @@ from gpusense.models.point.base import (
     two_parts,
 )
 from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
+from gpusense.reference.error_free import two_sum
 from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import BeaconParameters
 
@@ -194,18 +195,19 @@ class BeaconModel(PointModel):
         index = self._indices(ids)
         z = checks.array("ranges", on_host, (len(index),), finite=False)
         missing, valid = np.isnan(z), (z >= 0) & (z <= p.range_max)
-        left_out, rows, used = [], [], index[valid]
+        left_out: list[Omission] = []
         for what, which, why in (
             ("missing ranges", missing, "are nan"),
             ("impossible ranges", ~(missing | valid), f"are not in [0, {p.range_max:g}] m"),
         ):
             left_out += counted_omissions(what, int(np.count_nonzero(which)), len(z), why, "the ranges")
-        with localcontext(prec=DIGITS):
-            for (x, y), reading, bias in zip(self.xy[used], z[valid], self._bias[used], strict=True):
-                pairs = (x, self._origin[0]), (y, self._origin[1]), (reading, bias)
-                numbers = (Decimal(float(one)) - Decimal(float(other)) for one, other in pairs)
-                rows.append([*two_parts(numbers, self._real), self._real.type(bias)])
-        return np.array(rows, self._real).reshape(-1, BEACON), left_out
+        used = index[valid]
+        bias, rows = self._bias[used], np.empty((len(used), BEACON), self._real)
+        origin = np.column_stack([np.tile(self._origin, (len(used), 1)), bias])
+        numbers, rest = two_sum(np.column_stack([self.xy[used], z[valid]]), -origin)
+        rows[:, :-1:2], rows[:, -1] = numbers, bias
+        rows[:, 1::2] = (numbers - rows[:, :-1:2]) + rest
+        return rows, left_out
 
     def _mixture(self) -> tuple[int, BeaconTerms, np.ndarray]:
         """Return the kind of density, and the numbers and the series of the kernel file ``beacons``."""

@@ -16,7 +16,7 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
     const ilanes longer = far == 0 ? (ilanes)1 : far, shorter = far == 0 ? (ilanes)1 : flat ? far_y : far_x;
     const int stride = window.cols + 2;
     const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)stride : (ilanes)-stride;
-    const ilanes ahead = flat ? step_x : step_y, sideways = flat ? step_y : step_x;
+    const ilanes onward = flat ? step_x : step_y, sideways = flat ? step_y : step_x;
 #if AMCL_LINES
     const ilanes last = far + 1;
 #else
@@ -45,7 +45,7 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
         more += (rest < 0) - (rest >= whole_line);
         rest += (rest < 0 ? whole_line : (ilanes)0) - (rest >= whole_line ? whole_line : (ilanes)0);
         aside += more;
-        at = origin + along * ahead + aside * sideways;
+        at = origin + along * onward + aside * sideways;
     }
     const lanes i = to_lanes(along), j = to_lanes(aside);
     return met ? sqrt(i * i + j * j) : limit;

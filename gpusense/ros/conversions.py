@@ -17,10 +17,16 @@ from gpusense._util import checks
 from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
 from gpusense.localization.spread import check_risk
+from gpusense.logs.bag_beams import Beams, alike
 from gpusense.logs.records import Pose, planar_mount, pose_fields
-from gpusense.world.messages import field, planar_covariance, planar_pose
+from gpusense.world.messages import field, laser_beams, planar_covariance, planar_pose
 from gpusense.world.pose_algebra import compose_poses, invert_poses
 from gpusense.world.scanner import Scanner
+
+PLACES = 1440
+"""Beams of the common scanner for varying beams."""
+# Least difference of distinct mounts [m, rad]: a body on springs moves a laser by millimetres.
+_SAME_MOUNT = 5e-3
 
 
 def pose_matrix(pose: Pose) -> np.ndarray:
@@ -86,6 +92,31 @@ def laser_scan(
         nearest = near
     scanner = Scanner.from_laser_scan(fields, mount, range_max=farthest, range_min=nearest)
     return scanner, fields | {"range_min": scanner.range_min, "range_max": scanner.range_max}
+
+
+class CommonBeams:
+    """Readings of a laser's scans on the beams of one ``scanner``, as in logs.
+
+    The first scan's geometry is the scanner. After a scan of another geometry, all scans move to common bearings, so
+    that varying beams need only a second scanner. A mount that moves needs another one each time. Readings of 0 are
+    missing, and each scan keeps its limits.
+    """
+
+    def __init__(self) -> None:
+        self.scanner: Scanner | None = None
+        self._beams: Beams | None = None
+
+    def take(self, scanner: Scanner, fields: Mapping[str, Any]) -> np.ndarray:
+        """Return the readings of a scan, from the results of ``laser_scan``; ``scanner`` may become another object."""
+        angles, limits = laser_beams(fields), (scanner.range_min, scanner.range_max)
+        if self._beams is None or self.scanner is None:
+            self._beams, self.scanner = Beams(*angles, *limits), scanner
+        elif not (self._beams.varied or alike((self._beams.first, self._beams.step, self._beams.count), angles)):
+            self._beams = Beams(-math.pi, 2 * math.pi / PLACES, PLACES, *limits, varied=True)
+            self.scanner = self._beams.scanner(scanner.mount, upside_down=False)
+        elif not np.allclose(self.scanner.mount, scanner.mount, rtol=0, atol=_SAME_MOUNT):
+            self.scanner = self._beams.scanner(scanner.mount, upside_down=False)
+        return self._beams.take(fields)[0]
 
 
 def cloud_fields(particles: np.ndarray, weights: np.ndarray, most: int = 2000) -> list[dict[str, Any]]:

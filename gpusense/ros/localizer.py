@@ -1,11 +1,11 @@
-"""Localise without ROS, behind the node: queue scans, and estimate pose, cloud and transform from them."""
+"""Localise without ROS, behind the node: estimate pose, cloud and transform from scans."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,32 +14,30 @@ from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import Nav2Options
 from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
 from gpusense.localization.scan_motion import Moment
-from gpusense.logs.bag_beams import Beams, alike
 from gpusense.logs.records import Pose
-from gpusense.logs.transform_buffer import BACK, TransformError
 from gpusense.ros.conversions import (
     ERROR,
     LEVELS,
     STALE,
     WARN,
+    CommonBeams,
     host_array,
     laser_scan,
     map_to_odometry,
     moved_enough,
     status_fields,
 )
+from gpusense.ros.pacing import Rest
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.messages import laser_beams, stamp_of
+from gpusense.world.messages import stamp_of
 from gpusense.world.scanner import Scanner
 
-PLACES = 1440
-"""Beams of the common scanner for varying beams."""
 # Time without a scan after which diagnostics are stale [s].
 _PATIENCE = 5.0
 # Scans that the likely cause is looked for in.
 _HISTORY = 150
-# Least difference of distinct mounts [m, rad].
-_SAME_MOUNT = 1e-3
+# Made-up scans for the first compilation of this search.
+_WARM = 12
 # Standard deviations of a first pose, as in nav2_amcl [m, m, rad].
 _START = (0.5, 0.5, math.pi / 12)
 
@@ -65,11 +63,12 @@ class Localizer:
         self.grid: OccupancyGrid | None = None
         self.filter: Any = None
         self._scanner: Scanner | None = None
-        self._beams: Beams | None = None
+        self._beams = CommonBeams()
         self.estimate: Any = None
         self.counted = 0
-        # Text of the likely cause of the last estimate; None before the search.
-        self._cause: str | None = None
+        # The last search for the likely cause: number and verdict of its estimate, and its text.
+        self._cause: tuple[int, str, str] | None = None
+        self._rest = Rest(clock)
         self._history: deque[Moment] = deque(maxlen=_HISTORY)
         self._taken = clock()
         self.problem: str | None = None
@@ -80,12 +79,14 @@ class Localizer:
             self.start_at(options.initial_pose, np.asarray(covariance))
 
     def warm_up(self) -> None:
-        """Open the device, and compile the code for scans on the map or a made-up room."""
+        """Open the device, and compile the code for scans and causes on the map or a made-up room."""
         cells = np.zeros((80, 80), np.int8)
         cells[[0, -1]] = cells[:, [0, -1]] = 100
         grid = OccupancyGrid(cells, 0.1) if self.grid is None else self.grid
         scanner = Scanner.uniform(angle_min=-math.pi, angle_increment=math.pi / 180, count=360, range_max=10.0)
         made = self.options.make_filter(self.options.make_model(grid, scanner, backend=self.backend), seed=self.seed)
+        if _is_reference(made):
+            return
         for start in range(2):
             if start == 0:
                 made.initialize_uniform()
@@ -97,15 +98,18 @@ class Localizer:
                 made.estimate()
                 made.diagnose()
                 made.predict((0.1 * step, 0.0, 0.0), (0.1 * (step + 1), 0.0, 0.0))
+        poses = [(0.3 * k, 0.0, 0.0) for k in range(_WARM)]
+        moments = [Moment(np.full(360, 4.0), pose, pose, float(k)) for k, pose in enumerate(poses)]
+        self._likely_cause(made, moments)
 
     def begin(self) -> None:
         """Count the time without scans from now on."""
         self._taken = self._clock()
 
     def set_map(self, grid: OccupancyGrid) -> None:
-        """Take a map; a filter continues around its last estimate."""
+        """Take a map; a filter continues with its particles, and the map that it has changes nothing."""
         before, self.grid = self.grid, grid
-        if self.filter is None:
+        if self.filter is None or grid == before:
             return
         try:
             self._make(self._scanner)
@@ -125,10 +129,10 @@ class Localizer:
 
     def start_again(self) -> None:
         """Repeat the last start: around a pose, or all over the map."""
-        self._last = self.estimate = None
+        self._last = self.estimate = self._cause = None
         self._history.clear()
         if self.filter is not None:
-            self._initialize()
+            self._initialize(self.filter)
 
     def update(self, message: Any, odometry: Pose, laser: np.ndarray) -> bool:
         """Take a LaserScan with the robot's odometry and the laser's (4, 4) pose; return whether it is used.
@@ -146,7 +150,9 @@ class Localizer:
             self.problem = str(error)
             return False
         self._taken = self._clock()
-        ranges = self._readings(fields, scanner)
+        ranges = self._beams.take(scanner, fields)
+        if self._beams.scanner is not self._scanner:
+            self._make(self._beams.scanner)
         if self._last is not None and not moved_enough(self._last, odometry, self.options.update_min):
             return False
         if self._last is not None:
@@ -154,7 +160,7 @@ class Localizer:
         self.filter.correct(ranges)
         self._last, self.estimate = odometry, self.filter.estimate()
         self._history.append(Moment(ranges, self.estimate.pose, odometry, stamp))
-        self.counted, self._cause = self.counted + 1, None
+        self.counted += 1
         return True
 
     def map_to_odometry(self) -> Pose:
@@ -186,141 +192,48 @@ class Localizer:
             "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
             "radius": f"{found.protection_level(self.risk):.3f}", "risk": f"{self.risk:g}",
         }  # fmt: skip
-        if found.verdict != "tracking" and self._cause is None:
-            self._cause = self._likely_cause()
-        text = ": ".join(filter(None, (found.verdict, self._cause)))
+        text = ": ".join(filter(None, (found.verdict, self._cause_of(found.verdict))))
         return status_fields("filter", LEVELS[found.verdict], text, values, node)
 
-    def _likely_cause(self) -> str:
+    def _cause_of(self, verdict: str) -> str | None:
+        """Return the likely cause of a verdict; the search rests, and its text then stays while the verdict does."""
+        if verdict == "tracking":
+            return None
+        if (self._cause is None or self._cause[0] != self.counted) and self._rest.over:
+            with self._rest.after():
+                self._cause = self.counted, verdict, self._likely_cause(self.filter, self._history)
+        return self._cause[2] if self._cause is not None and self._cause[1] == verdict else None
+
+    def _likely_cause(self, judged: Any, moments: Sequence[Moment]) -> str:
         """Return the likely cause by the last scan and, with kernels, by the motion between the scans of the run.
 
         The reference would match those scans for seconds.
         """
-        if self.filter.models[0].device.selection != "numpy":
-            run = diagnose_run(self.filter.models, self._history, search=False)
+        if not _is_reference(judged):
+            run = diagnose_run(judged.models, moments, search=False)
             if run.cause in CAUSES_OF_RUNS:
                 return run.text
-        return str(self.filter.diagnose().text)
-
-    def _readings(self, fields: Mapping[str, Any], scanner: Scanner) -> np.ndarray:
-        """Return the readings for the filter's scanner, as in logs; make the filter if it is missing.
-
-        The first scan's geometry is the scanner. After a scan of another geometry, all scans move to common bearings,
-        so that varying beams need only a second model. Readings of 0 are missing, and each scan keeps its limits.
-        """
-        angles, limits = laser_beams(fields), (scanner.range_min, scanner.range_max)
-        before, beams = self._scanner, self._beams
-        if before is None or beams is None or self.filter is None:
-            beams = self._beams = Beams(*angles, *limits)
-            self._make(scanner)
-        elif not beams.varied and not (
-            alike((beams.first, beams.step, beams.count), angles)
-            and np.allclose(before.mount, scanner.mount, rtol=0, atol=_SAME_MOUNT)
-        ):
-            beams = self._beams = Beams(-math.pi, 2 * math.pi / PLACES, PLACES, *limits, varied=True)
-            self._make(beams.scanner(scanner.mount, upside_down=False))
-        return beams.take(fields)[0]
+        return str(judged.diagnose().text)
 
     def _make(self, scanner: Scanner | None) -> None:
+        """Make a filter for a scanner and the map, with the particles of the filter before it."""
         assert self.grid is not None and scanner is not None
-        self._history.clear()
         model = self.options.make_model(self.grid, scanner, backend=self.backend)
-        before, self.filter = self.filter, self.options.make_filter(model, seed=self.seed)
-        self._scanner = scanner
-        if before is not None and self.estimate is not None:
-            estimate = before.estimate()
-            self.filter.initialize(mean=estimate.pose, covariance=estimate.covariance)
+        made = self.options.make_filter(model, seed=self.seed)
+        if self.filter is None or self.estimate is None:
+            self._initialize(made)
         else:
-            self._initialize()
+            made.restore(self.filter.state())
+        self.filter, self._scanner, self._cause = made, scanner, None
+        self._history.clear()
 
-    def _initialize(self) -> None:
+    def _initialize(self, made: Any) -> None:
         if self._start is None:
-            self.filter.initialize_uniform()
+            made.initialize_uniform()
         else:
-            self.filter.initialize(mean=self._start[0], covariance=self._start[1])
+            made.initialize(mean=self._start[0], covariance=self._start[1])
 
 
-MOST = 500
-"""Most waiting scans."""
-# Most time that counts as waiting between two looks [s]: a longer one was spent on other work.
-_LONGEST = 0.5
-
-
-class ScanQueue:
-    """Queue of scans that wait for their transforms, at most ``patience`` seconds in which the node was idle.
-
-    A scan beyond ``most`` drops the oldest. ``dropped`` counts these, and ``reason`` explains the last.
-    """
-
-    def __init__(
-        self,
-        look_up: Callable[[Any], Any],
-        deliver: Callable[[Any, Any], None],
-        *,
-        patience: float = 1.0,
-        most: int = MOST,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._look_up, self._deliver, self._clock = look_up, deliver, clock
-        self.patience, self.most = patience, most
-        self.dropped = 0
-        self.reason: str | None = None
-        self._waiting: deque[tuple[float, float, Any]] = deque()
-        self._looked, self._waited = clock(), 0.0
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def add(self, scan: Any, stamp: float) -> None:
-        """Add a scan, drop waiting ones over 2 s later (a recording restarted), and deliver ready scans."""
-        later = [each for each in self._waiting if each[1] > stamp + BACK]
-        for each in later:
-            self._waiting.remove(each)
-            self._drop("the stamps of scans went back")
-        self._count()
-        self._waiting.append((self._waited, stamp, scan))
-        self.check()
-        while len(self._waiting) > self.most:
-            self._waiting.popleft()
-            self._drop(f"more than {self.most} scans wait for their transforms")
-
-    def check(self) -> None:
-        """Deliver scans with known transforms, oldest first, and drop scans that waited too long.
-
-        Transforms arrive in the order of time. Scans before a ready one are older than every known transform, and
-        never become ready. After a scan that must wait, all others must wait.
-        """
-        self._count()
-        position = 0
-        while position < len(self._waiting):
-            since, _, scan = self._waiting[position]
-            try:
-                transforms = self._look_up(scan)
-            except TransformError as error:
-                if self._waited - since > self.patience:
-                    del self._waiting[position]
-                    self._drop(f"no transform within {self.patience:g} s: {error}")
-                elif error.early:
-                    return
-                else:
-                    position += 1
-                continue
-            for _ in range(position):
-                self._waiting.popleft()
-                self._drop("the transforms begin after the scan")
-            self._waiting.popleft()
-            position = 0
-            self._deliver(scan, transforms)
-            self._looked = self._clock()
-
-    def clear(self) -> None:
-        """Drop all waiting scans, for a deactivated node."""
-        self._waiting.clear()
-
-    def _count(self) -> None:
-        """Count the time since the last look as waiting."""
-        now = self._clock()
-        self._waited, self._looked = self._waited + min(now - self._looked, _LONGEST), now
-
-    def _drop(self, reason: str) -> None:
-        self.dropped, self.reason = self.dropped + 1, reason
+def _is_reference(made: Any) -> bool:
+    """Return whether a filter runs by the NumPy reference, which compiles nothing."""
+    return bool(made.models[0].device.selection == "numpy")

@@ -16,6 +16,8 @@ from gpusense.ros.conversions import moved_enough
 from gpusense.world.messages import planar_pose, stamp_of
 
 need_ros()
+from nav2_msgs.msg import ParticleCloud  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from support.ros_robot import play, started, wait_for  # noqa: E402
 
 PARAMETERS = """\
@@ -70,12 +72,15 @@ def test_the_poses_are_those_of_the_filter_offline(robot: Any, recording: Path, 
         if not without:
             assert robot.change("CONFIGURE") and robot.change("ACTIVATE")
             assert robot.state() == "active"
-        poses = robot.poses()
+        poses, clouds = robot.poses(), robot.listen(ParticleCloud, "particle_cloud", qos_profile_sensor_data)
         node.says("parameters without effect: save_pose_rate")
         node.says("odometry is read from the topic odom" if without else "compiled for numpy")
         scans = play(robot, recording / "bag", 10.0, skip=("/tf", "/tf_static") if without else ())
         expected = offline(recording)
         wait_for(lambda: len(poses) >= 0.95 * scans, "poses")
+        # The last particles come after a rest, or with the last pose.
+        wait_for(lambda: clouds and clouds[-1].header == poses[-1].header, "the particles of the last pose")
+        assert {len(one.particles) for one in clouds} <= set(range(500, 801))
         assert node.alive() and node.stop() == 0
     assert scans == 120
     found = {round(stamp_of("pose", each), 3): planar_pose("pose", each.pose.pose) for each in poses}

@@ -1,4 +1,4 @@
-"""The parts of the nodes that need no ROS: conversions, the localiser, the watcher, and the queue of scans."""
+"""The parts of the nodes that need no ROS: conversions and the localiser."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from support.ros_messages import grid, scan_of
 
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.logs.records import planar
-from gpusense.logs.transform_buffer import TransformError
-from gpusense.ros import conversions, localizer, watcher
-from gpusense.ros.localizer import ScanQueue
+from gpusense.ros import conversions, localizer
 from gpusense.world.messages import planar_covariance, planar_pose
 
 from_nav2 = gs.compat.from_nav2
@@ -65,18 +64,11 @@ class FakeFilter:
     def estimate(self) -> Any:
         return SimpleNamespace(pose=np.array([1.0, 2.0, 0.5]), covariance=np.eye(3))
 
+    def state(self) -> FakeFilter:
+        return self
 
-def scan_of(count: int, seconds: int = 0) -> Any:
-    header = SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=0))
-    return SimpleNamespace(header=header, angle_min=-math.pi, angle_increment=2 * math.pi / count, range_min=0.1,
-                           range_max=8.0, ranges=np.full(count, 2.0))  # fmt: skip
-
-
-def grid(wall: int = 0) -> gs.OccupancyGrid:
-    """Return a room, with a wall of some cells in it."""
-    cells = np.zeros((40, 40), np.int8)
-    cells[[0, -1]] = cells[:, [0, -1]] = cells[:wall, 20] = 100
-    return gs.OccupancyGrid(cells, 0.1)
+    def restore(self, state: FakeFilter) -> None:
+        self.calls.append(("restore", state))
 
 
 @pytest.fixture
@@ -109,13 +101,14 @@ def test_the_localizer_drives_a_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(localizer.map_to_odometry((1.0, 2.0, 0.5), (0.3, 0.0, 0.0)), own.map_to_odometry())
     for k, count in enumerate((91, 88, 90)):
         assert own.update(scan_of(count), (1.0 + k, 0.0, 0.0), AHEAD)
-    assert len(FakeFilter.made) == 2 and FakeFilter.made[1].calls[0][0] == "initialize"
+    assert len(FakeFilter.made) == 2 and FakeFilter.made[1].calls[0] == ("restore", made)
     assert np.isfinite(FakeFilter.made[1].calls[-1][1]).sum() == 90
     own.set_map(grid())
+    assert len(FakeFilter.made) == 2
+    own.set_map(grid(5))
     assert own.update(scan_of(90), (5.0, 0.0, 0.0), AHEAD)
     again = FakeFilter.made[2].calls
-    assert [call[0] for call in again] == ["initialize", "predict", "correct"]
-    np.testing.assert_array_equal(again[0][1]["mean"], (1.0, 2.0, 0.5))
+    assert [call[0] for call in again] == ["restore", "predict", "correct"] and again[0][1] is FakeFilter.made[1]
     assert again[1] == ("predict", (3.0, 0.0, 0.0), (5.0, 0.0, 0.0))
 
 
@@ -150,14 +143,54 @@ def test_a_beam_that_repeats_the_first_direction_is_used_once(own: localizer.Loc
 
 def test_a_scanner_of_as_many_beams_as_places_may_vary(own: localizer.Localizer) -> None:
     for k in range(2):
-        message = scan_of(localizer.PLACES)
-        message.angle_min, message.angle_increment = -1.0 + 0.1 * k, 2.0 / localizer.PLACES
+        message = scan_of(conversions.PLACES)
+        message.angle_min, message.angle_increment = -1.0 + 0.1 * k, 2.0 / conversions.PLACES
         assert own.update(message, (1.0 * k, 0.0, 0.0), np.eye(4))
     first, second = FakeFilter.made
     assert np.isfinite(first.calls[-1][1]).all()
     # Readings of 2 are at bearings of 2 rad.
     read = second.model.scanner.bearings[np.isfinite(second.calls[-1][1])]
     assert read.min() == pytest.approx(-0.9, abs=0.005) and read.max() == pytest.approx(1.1, abs=0.005)
+
+
+def test_a_mount_that_moves_moves_the_scanner(own: localizer.Localizer) -> None:
+    """Also among scans of varying beams; a body on springs changes nothing."""
+    laser, count = AHEAD.copy(), [90, 90, 90, 60, 60]
+    for k, ahead in enumerate((0.1, 0.104, 0.3, 0.3, 0.5)):
+        laser[0, 3] = ahead
+        assert own.update(scan_of(count[k]), (1.0 * k, 0.0, 0.0), laser)
+    assert [each.model.scanner.mount[0] for each in FakeFilter.made] == [0.1, 0.3, 0.3, 0.5]
+    assert [each.model.scanner.count for each in FakeFilter.made] == [90, 90, 1440, 1440]
+    assert [each.calls[0][0] for each in FakeFilter.made] == ["uniform", "restore", "restore", "restore"]
+
+
+def test_a_map_that_cannot_be_used_leaves_the_filter(own: localizer.Localizer, monkeypatch: Any) -> None:
+    assert own.update(scan_of(9), (0.0, 0.0, 0.0), AHEAD)
+    before, walls = own.filter, own.grid
+    monkeypatch.setattr(FakeFilter, "restore", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        own.set_map(grid(5))
+    for _ in range(2):
+        # A scan that the filter cannot be made for is tried again.
+        with pytest.raises(ZeroDivisionError):
+            own.update(scan_of(30), (1.0, 0.0, 0.0), AHEAD)
+    assert own.filter is before and own.grid is walls
+    monkeypatch.undo()
+    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
+    assert own.update(scan_of(30), (1.0, 0.0, 0.0), AHEAD) and own.filter is not before
+
+
+def test_maps_of_other_sizes_keep_the_particles() -> None:
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1, "max_particles": 600}), backend="numpy")
+    own.set_map(grid())
+    own.start_at((1.0, 1.3, 0.2), np.diag([0.01, 0.01, 0.01]))
+    assert own.update(scan_of(9), (0.0, 0.0, 0.0), AHEAD)
+    particles, weights = own.cloud()
+    for shape in ((60, 50), (20, 20), (8, 8)):
+        own.set_map(gs.OccupancyGrid(np.pad(np.zeros(shape, np.int8), 1, constant_values=100), 0.1))
+        np.testing.assert_array_equal(own.cloud()[0], particles)
+        np.testing.assert_array_equal(own.cloud()[1], weights)
+    assert own.update(scan_of(9), (0.3, 0.0, 0.0), AHEAD)
 
 
 def test_the_localizer_localises() -> None:
@@ -199,6 +232,36 @@ def test_the_cause_comes_once_from_scans_at_their_stamps(monkeypatch: pytest.Mon
     assert own.update(scan_of(60, 115), (0.9, 0.0, 0.0), np.eye(4)) and "wrong" not in own.status({})["message"]
 
 
+def test_the_search_for_the_cause_rests_ten_times_its_duration(own: localizer.Localizer, monkeypatch: Any) -> None:
+    now, searches, words = [0.0], [], ["lost"]
+
+    def search(self: Any, *_: Any) -> str:
+        now[0] += 2.0
+        searches.append(self.counted)
+        return f"cause {self.counted}"
+
+    def estimate(self: Any) -> Any:
+        return SimpleNamespace(pose=np.zeros(3), verdict=words[0], p_lost=1.0, explained=0.0, particles=1,
+                               effective_sample_size=1.0, protection_level=lambda _: 1.0)  # fmt: skip
+
+    monkeypatch.setattr(localizer.Localizer, "_likely_cause", search)
+    monkeypatch.setattr(FakeFilter, "estimate", estimate)
+    own = localizer.Localizer(own.options, backend="numpy", clock=lambda: now[0])
+    own.set_map(grid())
+
+    def message(k: int, verdict: str, time: float) -> Any:
+        now[0], words[0] = time, verdict
+        assert own.update(scan_of(9), (1.0 * k, 0.0, 0.0), AHEAD)
+        return own.status({})["message"]
+
+    assert message(0, "lost", 0.0) == "lost: cause 1" == message(1, "lost", 10.0) == message(2, "lost", 21.9)
+    # While it rests, the cause of another verdict is unknown.
+    assert message(3, "uncertain", 21.9) == "uncertain" and message(4, "tracking", 21.9) == "tracking"
+    assert message(5, "lost", 22.0) == "lost: cause 6" and searches == [1, 6]
+    own.start_again()
+    assert message(6, "lost", 30.0) == "lost" and message(7, "lost", 50.0) == "lost: cause 8"
+
+
 def test_the_node_names_a_wrong_odometry(needs: Any) -> None:
     """The odometry turns by 0.2 rad more than the robot at each scan, and counts as exact: the robot is soon lost."""
     walls, scanner = gs.worlds.building(seed=4, size=(24.0, 16.0)), gs.Scanner(np.linspace(-2, 2, 81), range_max=15.0)
@@ -216,77 +279,6 @@ def test_the_node_names_a_wrong_odometry(needs: Any) -> None:
         assert own.update(message, tuple(odometry.tolist()), np.eye(4))
     status = own.status({})
     assert status["level"] == 2 and status["message"].endswith("likely cause: wrong odometry")
-
-
-# ------------------------------------------------------------------------------------------------- the watching node
-
-
-def stamped(time: float, frame: str = "map", **fields: Any) -> Any:
-    stamp = SimpleNamespace(sec=int(time), nanosec=round((time - int(time)) * 1e9))
-    return SimpleNamespace(**fields | {"header": SimpleNamespace(stamp=stamp, frame_id=frame)})
-
-
-def pose_message(time: float, pose: Any, deviation: float = 0.05) -> Any:
-    place = SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())
-    conversions.fill(place, conversions.pose_fields(tuple(map(float, pose))))
-    covariance = conversions.covariance_fields(np.diag([deviation**2, deviation**2, 0.0025]))
-    return stamped(time, pose=SimpleNamespace(pose=place, covariance=covariance))
-
-
-def test_the_watcher_publishes_the_verdict() -> None:
-    own, walls = watcher.Watcher(backend="numpy"), grid(25)
-    bearings = np.linspace(-math.pi, math.pi, 48, endpoint=False)
-    caster = gs.RayCaster(walls, range_max=8.0, backend="numpy")
-
-    def step(time: float, truth: np.ndarray, pose: np.ndarray, **more: Any) -> bool:
-        fields = vars(scan_of(48)) | {"ranges": caster.cast(truth[None], bearings)[0]}
-        own.add_scan(stamped(time, **fields), np.eye(4))
-        return own.add_pose(pose_message(time + 0.01, pose, **more))
-
-    truth = np.array([1.0, 1.0, 0.2])
-    assert not step(0.5, truth, truth) and own.status(0.6)["level"] == 3
-    own.set_map(walls)
-    for k in range(5):
-        assert step(1.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([0.1 * k, 0.0, 0.0]))
-    status = own.status(5.5)
-    assert status["level"] == 0 and status["message"] == "tracking"
-    values = {each["key"]: each["value"] for each in status["values"]}
-    assert float(values["p_lost"]) < 0.05 and values["verdict"] == "tracking"
-    # Deviations of 5 cm at a risk of 5 %, widened.
-    assert 0.1 < float(values["radius"]) < 0.4 and values["risk"] == "0.05"
-    assert own.status(30.0)["level"] == 3
-    # A wide pose, and one on the other side of the wall.
-    assert step(6.0, truth, truth, deviation=0.8) and own.status(6.0)["level"] == 1
-    own.reset()
-    assert own.status(6.0)["level"] == 3
-    for k in range(8):
-        assert step(7.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([1.8 + 0.1 * k, 1.5, 2.0]))
-    status = own.status(15.0)
-    assert status["level"] == 2 and status["message"].startswith("lost: ") and "likely cause" in status["message"]
-    assert {"key": "cause", "value": "start"} in status["values"]
-    assert {"key": "radius", "value": "inf"} in status["values"]
-    # No scan of this time, and a scan that breaks a rule.
-    assert not own.add_pose(pose_message(20.0, truth))
-    own.add_scan(stamped(21.0, **(vars(scan_of(48)) | {"angle_increment": 0.0})), np.eye(4))
-    assert "angle_increment" in own.problem
-    with pytest.raises(ValueError, match="covariance: must be finite"):
-        own.add_pose(pose_message(7.0, truth, deviation=math.nan))
-    with pytest.raises(ValueError, match="frame_id: must be 'map', got 'odom'"):
-        own.add_pose(stamped(7.0, "odom", pose=pose_message(7.0, truth).pose))
-
-
-def test_the_watcher_reports_the_cause_of_most_poses(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, names = watcher.Watcher(backend="numpy"), "map map start map start start start"
-    causes = (SimpleNamespace(cause=name, text=name) for name in names.split())
-    monitor = SimpleNamespace(update=lambda *_: gs.PoseVerdict(0.9, "lost", 0.1), diagnose=lambda: next(causes))
-    monkeypatch.setattr(own, "_monitor_of", lambda *_: monitor)
-    own.set_map(grid())
-    found = []
-    for k in range(7):
-        own.add_scan(stamped(float(k), **vars(scan_of(8))), np.eye(4))
-        assert own.add_pose(pose_message(float(k), (1.0, 1.0, 0.0)))
-        found.append(own.status(float(k))["values"][-1]["value"])
-    assert found == ["map"] * 6 + ["start"]
 
 
 # ------------------------------------------------------------------------------------------------ starts and scans
@@ -364,7 +356,11 @@ def test_the_first_scan_compiles_nothing(monkeypatch: pytest.MonkeyPatch, needs:
     for k in range(2):
         assert own.update(scan_of(90), (0.3 * k, 0.0, 0.0), AHEAD)
     own.start_anywhere()
-    assert own.update(scan_of(90), (0.6, 0.0, 0.0), AHEAD)
+    for k in range(30):
+        assert own.update(scan_of(90, k), (0.6 + 0.3 * k, 0.0, 0.0), AHEAD)
+    own.status({})
+    assert {"match_scans", "judge_beams"} <= {kernel for kernel, _ in made}
+    assert own.estimate.verdict != "tracking"
     assert warm and made == warm
 
 
@@ -387,64 +383,3 @@ def test_parameters_by_the_names_of_nav2() -> None:
 def test_parameters_that_break_a_rule(change: dict[str, Any], text: str) -> None:
     with pytest.raises((TypeError, ValueError, OSError), match=text):
         conversions.options_of(conversions.defaults() | change)
-
-
-# ------------------------------------------------------------------------------------------------------- the queue
-
-
-@pytest.fixture
-def queued() -> Any:
-    """Return a queue over scans that are their times, its clock, its known transforms and what it delivered."""
-    now, known, out = [0.0], set(), []
-
-    def look_up(scan: int) -> str:
-        if scan not in known:
-            raise TransformError(f"none at {scan}", early=scan > max(known, default=0))
-        return f"t{scan}"
-
-    return ScanQueue(look_up, lambda *pair: out.append(pair), most=3, clock=lambda: now[0]), now, known, out
-
-
-def test_scans_are_delivered_in_their_order(queued: Any) -> None:
-    queue, _, known, out = queued
-    for scan in (1, 2, 3):
-        queue.add(scan, scan)
-    known |= {1, 2, 3}
-    queue.check()
-    assert out == [(1, "t1"), (2, "t2"), (3, "t3")] and queue.dropped == 0
-
-
-def test_a_scan_from_before_the_transforms_is_dropped(queued: Any) -> None:
-    queue, _, known, out = queued
-    queue.add(1, 1)
-    known |= {2}
-    queue.add(2, 2)
-    assert out == [(2, "t2")] and queue.dropped == 1 and queue.reason == "the transforms begin after the scan"
-
-
-def test_patience_and_length(queued: Any) -> None:
-    queue, now, known, out = queued
-    for scan in range(5):
-        now[0] = 0.3 * scan
-        queue.add(scan, scan)
-    assert len(queue) == 3 and queue.dropped == 2 and "more than 3" in queue.reason
-    now[0] = 1.61
-    queue.check()
-    assert len(queue) == 2 and queue.dropped == 3 and queue.reason == "no transform within 1 s: none at 2"
-    queue.clear()
-    queue.add(5, 5)
-    now[0] = 100.0  # a busy node reads what came before it drops scans
-    queue.check()
-    known |= {3, 4, 5}
-    queue.check()
-    assert out == [(5, "t5")]
-
-
-def test_scans_whose_stamps_go_back_replace_later_ones(queued: Any) -> None:
-    queue, _, known, out = queued
-    queue.add(1000, 1000)
-    queue.add(5, 5)
-    assert len(queue) == 1 and queue.dropped == 1 and queue.reason == "the stamps of scans went back"
-    known |= {5}
-    queue.check()
-    assert out == [(5, "t5")]

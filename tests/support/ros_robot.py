@@ -208,13 +208,14 @@ class Robot:
         self.publisher(LaserScan, "scan").publish(one)
 
     def initial_pose(self, x: float, variance: float = 0.01, frame: str = "map", topic: str = "initialpose",
-                     time: float = 0.0) -> None:  # fmt: skip
+                     time: float = 0.0) -> PoseWithCovarianceStamped:  # fmt: skip
         one = self.stamp(PoseWithCovarianceStamped(), time, frame)
         one.pose.pose.position.x, one.pose.pose.position.y, one.pose.pose.orientation.w = x, 1.3, 1.0
         covariance = np.zeros((6, 6))
         covariance[[0, 1, 5], [0, 1, 5]] = variance
         one.pose.covariance = covariance.ravel().tolist()
         self.publisher(PoseWithCovarianceStamped, topic).publish(one)
+        return one
 
     def map(self, **changes: Any) -> None:
         """Publish the room."""

@@ -27,8 +27,9 @@ from gpusense.logs.records import Pose, planar, pose_fields, transform_fields
 from gpusense.logs.transform_buffer import BACK
 from gpusense.ros import conversions
 from gpusense.ros.conversions import defaults, mount_of, options_of
-from gpusense.ros.localizer import Localizer, ScanQueue
+from gpusense.ros.localizer import Localizer
 from gpusense.ros.nodes.wiring import Guard, TFMessage, Transforms, diagnostic_array, latched, run, unreliable
+from gpusense.ros.pacing import Losses, Rest, ScanQueue
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.map_files import read_map
 from gpusense.world.messages import stamp_of
@@ -42,8 +43,6 @@ except ImportError:
 _LOOK = 0.1
 # Scans that wait in the middleware while the node is busy.
 _DEPTH = 50
-# Step of publication numbers that suggests another publisher.
-_GAP = 10_000
 
 
 class LocalizationNode(LifecycleNode):
@@ -121,7 +120,8 @@ class LocalizationNode(LifecycleNode):
         self.queue = ScanQueue(self.look_up, self.localize, patience=float(values["scan_patience"]))
         self.restarts = values["restart_after_jump"]
         self.received = self.lost = self.dropped = 0
-        self.number: int | None = None
+        self.losses = Losses()
+        self.rest, self.unshown = Rest(), False
         self.stamp = -float("inf")
         self.map_reason: str | None = None
         self._listen(values)
@@ -129,42 +129,46 @@ class LocalizationNode(LifecycleNode):
 
     def _listen(self, values: dict[str, Any]) -> None:
         """Create subscriptions, the service and timers, and record their destructors."""
-        frames = self.options.frames[1:]
         self.transforms = Transforms(
-            self, self.guard, frames, values["odom_topic"], mount_of(values["mount"]), self.check_waiting
-        )
-        made = list(self.transforms.subscriptions)
+            self.guard, self.options.frames[1:], values["odom_topic"], mount_of(values["mount"]), self.check_waiting,
+            self.options.frames[0],
+        )  # fmt: skip
+        try:
+            self.transforms.subscribe(self)
+        finally:
+            self._made += [(self.destroy_subscription, each) for each in self.transforms.subscriptions]
         map_topic, scan_topic = self.options.topics
-        quality = SubscriptionEventCallbacks(incompatible_qos=self.on_map_quality)
-        if not values["map_file"]:
-            take = self.guard.around("map", self.on_map)
-            made.append(self.create_subscription(MapMessage, map_topic, take, latched(), event_callbacks=quality))
-        for kind, topic, callback, profile in (
+        topics: list[tuple[Any, ...]] = [
             (LaserScan, scan_topic, self.on_scan, unreliable(_DEPTH)),
             (PoseWithCovarianceStamped, "initialpose", self.on_initial_pose, 1),
-        ):
-            made.append(self.create_subscription(kind, topic, self.guard.around(topic, callback), profile))
-        self._made += [(self.destroy_subscription, each) for each in made]
+        ]
+        if not values["map_file"]:
+            topics.insert(0, (MapMessage, map_topic, self.on_map, latched()))
+        for kind, topic, callback, profile in topics:
+            events = SubscriptionEventCallbacks(incompatible_qos=self.on_map_quality) if kind is MapMessage else None
+            take = self.guard.around("map" if kind is MapMessage else topic, callback)
+            made = self.create_subscription(kind, topic, take, profile, event_callbacks=events)
+            self._made.append((self.destroy_subscription, made))
         anywhere = "reinitialize_global_localization"
         service = self.create_service(Empty, anywhere, self.guard.around(anywhere, self.on_reinitialize))
         self._made.append((self.destroy_service, service))
         # Scans wait by wall clock, since simulated time may stop.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        for period, name, work in ((_LOOK, "scans", self.check_waiting), (1.0, "status", self.publish_diagnostics)):
+        for period, name, work in ((_LOOK, "scans", self.check), (1.0, "status", self.publish_diagnostics)):
             timer = self.create_timer(period, self.guard.around(name, work), clock=steady)
             self._made.append((self.destroy_timer, timer))
 
     def _publish(self) -> None:
-        add = self.create_lifecycle_publisher
+        def add(*arguments: Any) -> Any:
+            made = self.create_lifecycle_publisher(*arguments)
+            self._made.append((self.destroy_lifecycle_publisher, made))
+            return made
+
         self.pose = add(PoseWithCovarianceStamped, "amcl_pose", latched())
         self.cloud = add(ParticleCloud or PoseArray, "particle_cloud", qos_profile_sensor_data)
         self.diagnostics = add(DiagnosticArray, "/diagnostics", 10)
-        publishers = [self.pose, self.cloud, self.diagnostics]
-        self.broadcaster: Any = None
-        if TFMessage is not None and self.options.tf_broadcast:
-            self.broadcaster = add(TFMessage, "/tf", 100)
-            publishers.append(self.broadcaster)
-        self._made += [(self.destroy_lifecycle_publisher, each) for each in publishers]
+        has_broadcast = TFMessage is not None and self.options.tf_broadcast
+        self.broadcaster: Any = add(TFMessage, "/tf", 100) if has_broadcast else None
 
     def _release(self) -> None:
         self.active = False
@@ -199,13 +203,10 @@ class LocalizationNode(LifecycleNode):
 
     def on_scan(self, message: LaserScan, info: Any) -> None:
         """Queue a scan until its transforms are known."""
-        number, before = info["publication_sequence_number"], self.number
-        self.number = number
+        lost = self.losses.take(info["publication_sequence_number"])
         if not self.active:
             return
-        self.received += 1
-        if before is not None and 1 < number - before < _GAP:
-            self.lost += number - before - 1
+        self.received, self.lost = self.received + 1, self.lost + lost
         self.queue.add(message, stamp_of("message", message))
         self._report_dropped()
 
@@ -215,6 +216,12 @@ class LocalizationNode(LifecycleNode):
             self.queue.check()
             self._report_dropped()
 
+    def check(self) -> None:
+        """Continue what waits: scans, and particles to publish."""
+        self.check_waiting()
+        if self.active and self.unshown:
+            self.publish_cloud()
+
     def _report_dropped(self) -> None:
         if self.queue.dropped > self.dropped:
             self.dropped = self.queue.dropped
@@ -222,6 +229,7 @@ class LocalizationNode(LifecycleNode):
 
     def look_up(self, message: LaserScan) -> tuple[Pose, Any]:
         """Return the pose of the base in the odometry frame at a scan's stamp, and the laser's (4, 4) on the base."""
+        self.transforms.take_waiting()
         laser = self.transforms.laser(message.header.frame_id)
         odometry = self.transforms.buffer.look_up(*self.options.frames[1:], stamp_of("message", message))
         return planar(odometry), laser
@@ -230,7 +238,9 @@ class LocalizationNode(LifecycleNode):
         """Localise with a scan, and publish the results."""
         stamp = stamp_of("message", message)
         if stamp < self.stamp - BACK:
-            self.get_logger().warning(f"time went back from {self.stamp:.3f} s to {stamp:.3f} s")
+            self.get_logger().warning(
+                f"time went back from {self.stamp:.3f} s to {stamp:.3f} s", throttle_duration_sec=2.0
+            )
             if self.restarts:
                 self.localizer.start_again()
         self.stamp = stamp
@@ -252,16 +262,23 @@ class LocalizationNode(LifecycleNode):
         conversions.fill(pose.pose.pose, pose_fields((x, y, yaw)))
         pose.pose.covariance = conversions.covariance_fields(estimate.covariance)
         self.pose.publish(pose)
-        if not self.cloud.get_subscription_count():
+        self.header, self.unshown = pose.header, True
+        self.publish_cloud()
+
+    def publish_cloud(self) -> None:
+        """Publish the particles, with rests: their message costs more than a scan."""
+        if not self.cloud.get_subscription_count() or not self.rest.over:
             return
-        particles = conversions.cloud_fields(*self.localizer.cloud())
-        if ParticleCloud is None:
-            cloud = PoseArray(header=pose.header)
-            cloud.poses = [conversions.fill(PoseMessage(), fields["pose"]) for fields in particles]
-        else:
-            cloud = ParticleCloud(header=pose.header)
-            cloud.particles = [conversions.fill(Particle(), fields) for fields in particles]
-        self.cloud.publish(cloud)
+        self.unshown = False
+        with self.rest.after():
+            particles = conversions.cloud_fields(*self.localizer.cloud())
+            if ParticleCloud is None:
+                cloud = PoseArray(header=self.header)
+                cloud.poses = [conversions.fill(PoseMessage(), fields["pose"]) for fields in particles]
+            else:
+                cloud = ParticleCloud(header=self.header)
+                cloud.particles = [conversions.fill(Particle(), fields) for fields in particles]
+            self.cloud.publish(cloud)
 
     def publish_transform(self, scan: LaserScan) -> None:
         """Send the transform from the map to the odometry frame."""

@@ -6,7 +6,7 @@ import functools
 import math
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,8 +27,10 @@ try:
 except ImportError:
     TFMessage = None
 
-# Time to keep moving transforms, as in tf2 [s].
-_CACHE = 10.0
+# Time to keep moving transforms [s]: a busy node may lag behind a recording that plays faster.
+_CACHE = 30.0
+# Messages of moving transforms, and of odometry, that wait in the middleware while the node is busy.
+_DEPTH = 1000
 # Least time between log lines about a subject [s].
 _QUIET = 2.0
 
@@ -41,6 +43,16 @@ def latched() -> QoSProfile:
 def unreliable(depth: int) -> QoSProfile:
     """Return the quality of service of sensors, with a longer queue."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield the messages that wait at a subscription, each with its info.
+
+    The executor takes one message of each topic in a round, so frequent topics lag behind costly callbacks.
+    """
+    with subscription.handle:
+        while (taken := subscription.handle.take_message(subscription.msg_type, False)) is not None:
+            yield taken
 
 
 def diagnostic_array(fields: dict[str, Any], stamp: Any) -> DiagnosticArray:
@@ -99,35 +111,53 @@ class Transforms:
     """Transforms of the robot, from ``/tf``, or odometry from ``nav_msgs/Odometry`` and the mount from a parameter.
 
     An empty topic ``odometry``, or None as ``mount`` (x, y, yaw), leaves it to ``/tf``. ``arrived`` is called after new
-    transforms.
+    transforms. Transforms from and to the frame ``apart``, of the map, do not count: localisers send them.
     """
 
     def __init__(
         self,
-        node: Any,
         guard: Guard,
         frames: tuple[str, str],
         odometry: str = "",
         mount: Pose | None = None,
         arrived: Callable[[], None] = lambda: None,
+        apart: str = "",
     ) -> None:
         self.buffer, self.frames, self.guard, self.arrived = TransformBuffer(_CACHE), frames, guard, arrived
-        self.mount, self._warned = mount, False
-        self.subscriptions = []
+        self.odometry, self.mount, self.apart, self._warned = odometry, mount, apart.strip("/"), False
+        self.subscriptions: list[Any] = []
+        self._takers: list[Callable[[Any], None]] = []
         if TFMessage is None:
-            self.mount = mount or (0.0, 0.0, 0.0)
-            odometry = odometry or "odom"
-            node.get_logger().warning(
-                f"tf2_msgs cannot be imported: odometry is read from the topic {odometry}, the laser is taken to be at "
-                f"{self.mount} on the robot (parameter mount), and no transform is sent"
+            self.mount, self.odometry = mount or (0.0, 0.0, 0.0), odometry or "odom"
+            guard.log.warning(
+                f"tf2_msgs cannot be imported: odometry is read from the topic {self.odometry}, the laser is taken to "
+                f"be at {self.mount} on the robot (parameter mount), and no transform is sent"
             )
-        else:
+
+    def subscribe(self, node: Any) -> None:
+        """Make the ``subscriptions`` of a node."""
+        if TFMessage is not None:
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            for topic, quality in (("/tf", QoSProfile(depth=100)), ("/tf_static", kept)):
-                take = functools.partial(self._take, static=topic == "/tf_static")
-                self.subscriptions.append(node.create_subscription(TFMessage, topic, take, quality))
-        if odometry:
-            self.subscriptions.append(node.create_subscription(Odometry, odometry, self._take_odometry, 50))
+            self._listen(node, TFMessage, "/tf", QoSProfile(depth=_DEPTH), functools.partial(self._add, static=False))
+            self._listen(node, TFMessage, "/tf_static", kept, functools.partial(self._add, static=True))
+        if self.odometry:
+            self._listen(node, Odometry, self.odometry, unreliable(_DEPTH), self._add_odometry)
+
+    def _listen(self, node: Any, kind: Any, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
+        """Subscribe to a topic of transforms; ``take`` takes a message."""
+
+        def run(message: Any) -> None:
+            take(message)
+            self.guard.around("scans", self.arrived)()
+
+        self.subscriptions.append(node.create_subscription(kind, topic, run, quality))
+        self._takers.append(take)
+
+    def take_waiting(self) -> None:
+        """Take the messages that wait in the middleware."""
+        for subscription, take in zip(self.subscriptions, self._takers, strict=True):
+            for message, _ in waiting(subscription):
+                take(message)
 
     def laser(self, frame: str) -> np.ndarray:
         """Return the (4, 4) pose of a laser on the robot's base."""
@@ -141,14 +171,13 @@ class Transforms:
             self.guard.log.warning(f"the laser {frame} is tilted by {degrees:.3g} deg; it is taken to be level")
         return matrix
 
-    def _take(self, message: Any, static: bool) -> None:
+    def _add(self, message: Any, static: bool) -> None:
         for each in message.transforms:
-            self.guard.around("transforms", self.buffer.add)(each, static)
-        self.guard.around("scans", self.arrived)()
+            if self.apart not in (each.header.frame_id.strip("/"), each.child_frame_id.strip("/")):
+                self.guard.around("transforms", self.buffer.add)(each, static)
 
-    def _take_odometry(self, message: Odometry) -> None:
+    def _add_odometry(self, message: Odometry) -> None:
         self.guard.around("odometry", self.buffer.add)(odometry_fields(message, self.frames))
-        self.guard.around("scans", self.arrived)()
 
 
 def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:

@@ -214,13 +214,13 @@ def print_stretches(stretches: Sequence[gs.Stretch], begin: float, risk: float) 
 
 
 def _summary(one: gs.Stretch, begin: float, risk: float) -> str:
-    share, radius = "no beam to judge by", "no radius"
+    share, radius = "no beam to judge by", ""
     if math.isfinite(one.explained):
         share = f"{100 * one.explained:.0f} % of the beams explained"
     if math.isfinite(one.radius):
         some = "" if one.promised == 1 else f" ({math.floor(100 * one.promised)} % of the scans)"
-        radius = f"within {length(one.radius)} at risk {risk:g}{some}"
-    return f"{one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, {share}, {radius}"
+        radius = f", within {length(one.radius)} at risk {risk:g}{some}"
+    return f"{one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, {share}{radius}"
 
 
 def _place(one: gs.Stretch) -> str:

@@ -86,7 +86,7 @@ def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fi
         output.report(facts, args)
         return
     output.result(_fitness(fitness, pose_name(args)))
-    _print(score, pose_name(args))
+    _print(score, args.model, pose_name(args))
     output.interrupted(len(score.scans), chosen)
     values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
     how = "calibrated from the scans" if args.temperature == "auto" else "given"
@@ -105,11 +105,11 @@ def pose_name(args: argparse.Namespace) -> str:
     return "logged pose" if args.reference is None else "reference pose"
 
 
-def _print(score: LogScore, pose: str) -> None:
-    """Print the rank of the true pose, and the error of the weighted mean."""
+def _print(score: LogScore, model: str, pose: str) -> None:
+    """Print the model, the rank of the true pose, and the error of the weighted mean."""
     s = scoring.summary(score)
-    output.fact("device", f"{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
-                f"{grouped(score.particles)} particles each")  # fmt: skip
+    output.fact("model", f"{model}, on {score.device.selection} ({score.device.name}): "
+                f"{counted(len(score.scans), 'scan')}, {grouped(score.particles)} particles each")  # fmt: skip
     output.fact("rank", f"of the {pose} among them: median {number_text(s['rank_median'])}, better than "
                 f"{number_text(s['percentile_median'])} % in the median, {number_text(s['percentile_min'])} % at "
                 "least")  # fmt: skip

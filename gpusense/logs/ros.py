@@ -260,7 +260,8 @@ def read_poses(path: Path, times: Floats, *, topic: str | None = None, map_frame
     likely = [name for name in known if known[name] != ODOMETRY and not any(word in name for word in _NOT_POSES)]
     best = [name for name in likely if known[name] == POSE_WITH_COVARIANCE] or likely
     if topic is not None or len(best) != 1:
-        rule = f"must be given, one of {_names(known, False)}, for" if known else "must be in"
+        listed = f"must be given, a trajectory such as run.tum or one of {_names(known, False)}, for"
+        rule = listed if known else "must be in"
         got = "None" if known else f"no transforms from {map_frame!r} and no messages with poses"
         raise ValueError(f"poses: {rule} {path}, got {got}")
     return _of_topic(path, known[best[0]], best[0], map_frame)

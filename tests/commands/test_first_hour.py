@@ -62,7 +62,8 @@ def test_an_interrupted_score_prints_its_results_so_far(capsys, recorded, monkey
     assert main(score(recorded)) == 130
     out, err = capsys.readouterr()
     assert err == "gpusense: interrupted\n"
-    assert "interrupted: results of 3 of 5 scans" in out and "3 scans, 50 particles each" in out
+    assert "interrupted: results of 3 of 5 scans" in out and "3 scans, 50 particles each" in " ".join(out.split())
+    assert "model      beam, on numpy" in out
     assert main(score(recorded, "--json")) == 130
     document = json.loads(capsys.readouterr().out)
     assert [scan["index"] for scan in document["scans"]] == [0, 1, 2] and document["scans_chosen"] == 5

@@ -188,7 +188,7 @@ def test_a_choice_of_several_topics_is_left_to_the_user(tmp_path, capsys):
                 bag.pose(TIMES[k], x, y, theta, topic=topic, covariance=(0.01, 0.01, 0.01))
             bag.pose(TIMES[k], 0.0, 0.0, 0.0, topic="/initialpose", covariance=(0.2, 0.2, 0.1))
             bag.scan(TIMES[k], ranges()[k], -np.pi, 2 * np.pi / 90)
-    assert "must be given, one of" in error_of(call(tmp_path, bag.path), capsys)
+    assert "must be given, a trajectory such as run.tum or one of /" in error_of(call(tmp_path, bag.path), capsys)
     assert cli.main(call(tmp_path, bag.path, "--poses", "/pose_b")) == 0
 
 

@@ -9,12 +9,12 @@
 #define SERIES 12
 
 // Return the gap between outline and obstacle, negative where they overlap; the squared distance is in cells.
-real2 gap(const int squared, global const ContactTerms *terms) {
-    const real2 whole = two_sum((real)(squared >> 12) * 4096, (real)(squared & 4095));
+real2 gap(const integer squared, global const ContactTerms *terms) {
+    const real2 whole = two_sum(to_real(squared >> 12) * 4096, to_real(squared & 4095));
     const real d = sqrt(whole.x);
     const real2 dd = two_product(d, d);
     const real low = d > 0 ? ((whole.x - dd.x) + (whole.y - dd.y)) / (2 * d) : (real)0;
-    const real2 cells = squared == NO_OBSTACLE ? (real2)(FAR_CELLS, 0) : (real2)(d, low);
+    const real2 cells = where_pair(squared == NO_OBSTACLE, (real2)(FAR_CELLS, 0), (real2)(d, low));
     const real2 away = pair_product(cells, (real2)(terms->side, terms->side_low));
     const real2 left = two_sum(away.x, -terms->reach);
     return two_sum(left.x, left.y + (away.y - terms->reach_low));

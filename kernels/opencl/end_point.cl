@@ -4,7 +4,10 @@
 // requires: error_free
 
 // Clamp i to [0, last]; some drivers call clamp as a function.
-int within(const int i, const int last) { return i < 0 ? 0 : i > last ? last : i; }
+integer within(const integer i, const int last) {
+    const integer least = 0, most = last, raised = i > least ? i : least;
+    return raised < most ? raised : most;
+}
 
 // Return the index of a cell of the padded table; far cells become ring cells.
 int field_cell(const int col, const int row, const Window window) {
@@ -30,19 +33,20 @@ real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2
 // Return the whole cells below an offset of two parts; rest in [0, 1) is the remainder and to_next is 1 minus it. Both
 // are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below an
 // edge counts as on it, so that end points on edges fall into the same cell in every precision.
-int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
-    const int nearest = floor_int(offset.x + (real)0.5);
+integer whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
+    const integer nearest = floor_int(offset.x + (real)0.5);
 #if EXACT_EXPONENT
-    const real2 past = two_sum(offset.x - (real)nearest, offset.y);
-    const real2 other = pair_sum((real2)(1, 0), past.x < 0 ? past : -past);
+    const real2 past = two_sum(offset.x - to_real(nearest), offset.y), back = (real2)(-past.x, -past.y);
+    const real2 less = where_pair(past.x < 0, past, back), sum = ordered_sum((real)1, less.x);
+    const real2 other = ordered_sum(sum.x, sum.y + less.y);
 #else
-    const real2 past = (real2)((offset.x - (real)nearest) + offset.y, 0);
+    const real2 past = (real2)((offset.x - to_real(nearest)) + offset.y, 0), back = (real2)(-past.x, 0);
     const real2 other = (real2)(past.x < 0 ? 1 + past.x : 1 - past.x, 0);
 #endif
-    const int below = past.x + EDGE < 0;
-    *rest = below ? other : past;
-    *to_next = below ? -past : other;
-    return nearest - below;
+    const integer below = past.x + EDGE < 0;
+    *rest = where_pair(below, other, past);
+    *to_next = where_pair(below, back, other);
+    return nearest - (below & 1);
 }
 
 // An end point: its cell as an offset from the pose's cell, and its place between the edges of that cell.

@@ -1,6 +1,12 @@
 // Error-free transformations: a second number holds the rounding error of an operation. Source: Knuth (two_sum),
 // Dekker and Veltkamp (two_product). They need FP_CONTRACT OFF and no fast-math.
 
+// An integer, or whether a comparison holds; in lanes, each lane has one.
+typedef int integer;
+
+// Convert an integer.
+real to_real(const integer i) { return (real)i; }
+
 // Return a + b = sum.x + sum.y exactly.
 real2 two_sum(const real a, const real b) {
     const real sum = a + b;
@@ -72,6 +78,11 @@ int floor_int(const real a) {
 real2 add_term(const real2 total, const real term) {
     const real2 sum = two_sum(total.x, term);
     return (real2)(sum.x, total.y + sum.y);
+}
+
+// Return one pair of numbers where a comparison holds, and the other one elsewhere.
+real2 where_pair(const integer holds, const real2 one, const real2 other) {
+    return (real2)(holds ? one.x : other.x, holds ? one.y : other.y);
 }
 
 // Add a block to a compensated sum, by its strands.

@@ -39,26 +39,32 @@ real2 field_exponent(const real2 distance, global const FieldTerms *terms) {
     return shape_exponent(field_square(distance, terms), terms->shape_power, terms->shape_rate);
 }
 
-// Return log p of the distance from an end point to the nearest obstacle. If z_rand is 0, the logarithm belongs to a
-// hit alone.
-real log_field(const real2 distance, global const FieldTerms *terms) {
-    const real2 exponent = field_exponent(distance, terms);
+// Return log p of an end point from field_square. If z_rand is 0, the logarithm belongs to a hit alone.
+real log_square(const real2 square, global const FieldTerms *terms) {
+    const real2 exponent = shape_exponent(square, terms->shape_power, terms->shape_rate);
 #if LINEAR
     real p = terms->rand_density;  // 4: random measurement
 #if HIT
-    // 1: correct range.
-    p += terms->hit_peak * exp(-exponent.x) * (1 - exponent.y);
+    // 1: correct range. The second part is arbitrary where the density underflows.
+    const real hit = terms->hit_peak * exp(-exponent.x);
+    p += hit > 0 ? hit * (1 - exponent.y) : hit;
 #endif
     return log(p);
 #else
     const real hit = (terms->hit_peak - exponent.x) + (terms->hit_peak_low - exponent.y);
 #if RAND
-    const real largest = fmax(hit, terms->rand_density);
-    return largest + log(exp(hit - largest) + exp(terms->rand_density - largest));
+    const real random = terms->rand_density, largest = hit > random ? hit : random;
+    const real sum = largest + log(exp(hit - largest) + exp(random - largest));
+    return largest == -INFINITY ? largest : sum;
 #else
     return hit;
 #endif
 #endif
+}
+
+// Return log p of the distance from an end point to the nearest obstacle.
+real log_field(const real2 distance, global const FieldTerms *terms) {
+    return log_square(field_square(distance, terms), terms);
 }
 #endif
 

@@ -42,6 +42,8 @@ real2 two_sum(const real a, const real b) {
     return (real2)(sum, (a - (sum - b)) + f(a, (b)));
 }
 
+integer is_below(const integer i, const int last) { return i < last; }
+
 real twice(const real a) { return exp(two_sum(a, a).x) + a; }
 
 Turn turn_of(const double x, global const double *settings, const int kind) {
@@ -74,6 +76,10 @@ def test_calls_are_those_of_functions_in_lanes():
     alone = lanes_of("twice", "lanes unrelated(const lanes a) { return a; }\n")
     assert "exp_lanes(two_sum(a, a).x)" in alone
     assert alone.startswith("lanes unrelated") and '#line 3 "lanes/one.cl"' in alone
+
+
+def test_integers_of_lanes_are_named_so():
+    assert "ilanes is_below_lanes(const ilanes i, const int last) { return i < last; }" in lanes_of("is_below")
 
 
 def test_structs_become_structs_and_memory_stays():

@@ -2,17 +2,11 @@
 // points have the bits of the scalar kernel.
 // requires: lanes/end_point lanes/log_terms
 
-// in lanes: NO_OBSTACLE FAR_CELLS SERIES LOG_TWO_ROOT_PI
+// in lanes: NO_OBSTACLE FAR_CELLS SERIES LOG_TWO_ROOT_PI gap
 
 #define LOG_TWO 0.693147181f
 // From here on the series is accurate to float32.
 #define LARGE 4.0f
-
-// Poses of LANES particles.
-typedef struct {
-    ilanes col, row;
-    lanes x, y, cos, sin;
-} Particles;
 
 // Return the numbers in the cells of one point of the outline. One near a cell's edge is computed again by end_point.
 ilanes look_up_lanes(global const int *table, const Particles *particle, const real2 point, const real2 point_low,
@@ -36,18 +30,6 @@ ilanes look_up_lanes(global const int *table, const Particles *particle, const r
         }
     }
     return GATHER(ilanes, table, index);
-}
-
-LanePair gap_lanes(const ilanes squared, global const ContactTerms *terms) {
-    const LanePair whole = two_sum_lanes(to_lanes(squared >> 12) * 4096, to_lanes(squared & 4095));
-    const lanes d = sqrt(whole.x);
-    const LanePair dd = two_product_lanes(d, d);
-    const lanes low = d > 0 ? ((whole.x - dd.x) + (whole.y - dd.y)) / (2 * d) : (lanes)0;
-    const ilanes none = squared == NO_OBSTACLE;
-    const LanePair cells = {none ? (lanes)FAR_CELLS : d, none ? (lanes)0 : low};
-    const LanePair away = pair_product_lanes(cells, (LanePair){terms->side, terms->side_low});
-    const LanePair left = two_sum_lanes(away.x, (lanes)-terms->reach);
-    return two_sum_lanes(left.x, left.y + (away.y - terms->reach_low));
 }
 
 // Return log(erfc(x) / 2) for x >= 0, by an asymptotic series where erfc is small.
@@ -86,9 +68,7 @@ kernel void score_contact(ARGUMENTS) {
     Particles some;
     for (int i = 0; i < LANES; ++i) {
         const int n = min(first_particle + i, particles - 1);
-        ((int *)&some.col)[i] = pose_cell[n].x + FIELD_RING, ((int *)&some.row)[i] = pose_cell[n].y + FIELD_RING;
-        ((real *)&some.x)[i] = pose[n].x, ((real *)&some.y)[i] = pose[n].y;
-        ((real *)&some.cos)[i] = pose[n].z, ((real *)&some.sin)[i] = pose[n].w;
+        set_particle(&some, i, pose_cell[n], pose[n], 0, 1);
     }
     lanes total = 0;
     for (int s = 0; s < segments; ++s) {

@@ -11,14 +11,9 @@ typedef struct {
     lanes x, y, z, w;
 } LaneQuad;
 
-// in lanes: two_sum ordered_sum high_half two_product pair_sum pair_product add_term
+lanes to_real_lanes(const ilanes i) { return to_lanes(i); }
 
-// Return c - a b, where c is a b rounded or nearly so.
-lanes rest_lanes(const lanes a, const lanes b, const lanes c) {
-    if (FUSES) return fma(-a, b, c);
-    const LanePair product = two_product_lanes(a, b);
-    return (c - product.x) - product.y;
-}
+// in lanes: two_sum ordered_sum high_half two_product rest_of pair_sum pair_product add_term where_pair
 
 // Return a b + c, rounded once where the device has a fused multiply-add.
 lanes multiply_add_lanes(const lanes a, const lanes b, const lanes c) { return FUSES ? fma(a, b, c) : a * b + c; }

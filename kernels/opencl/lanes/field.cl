@@ -55,14 +55,14 @@ kernel void score_field(ARGUMENTS) {
         const Window seen = window;
         global const real *cells = table;
 #endif
-        Particles all[VECTORS];
+        FieldParticles all[VECTORS];
         lanes total[VECTORS], total_low[VECTORS];
         for (int v = 0; v * LANES < count; ++v) {
             total[v] = constant_term;
             total_low[v] = 0;
             for (int i = 0; i < LANES; ++i) {
                 const int lane = v * LANES + i, n = base + (lane < count ? lane : count - 1);
-                set_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
+                place_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
             }
         }
         for (int from = 0; from < all_readings; from += BLOCK_TERMS) {

@@ -4,49 +4,14 @@
 // requires: lanes/end_point lanes/math lanes/hit_shape
 
 #if BILINEAR
-// Return log p of end points, from the squares of their distances to the nearest obstacles over 2 sigma^2: log_field of
-// field_term.cl.
-lanes log_square_lanes(const LanePair square, global const FieldTerms *terms) {
-    const LanePair exponent = shape_exponent_lanes(square, terms->shape_power, terms->shape_rate);
-#if LINEAR
-    lanes p = terms->rand_density;
-#if HIT
-    const lanes hit = terms->hit_peak * exp_lanes(-exponent.x);
-#if EXACT_EXPONENT
-    p += hit > 0 ? hit * (1 - exponent.y) : hit;
-#else
-    p += hit;
-#endif
-#endif
-    return log_lanes(p);
-#else
-    const lanes hit = (terms->hit_peak - exponent.x) + (terms->hit_peak_low - exponent.y);
-#if RAND
-    const lanes random = terms->rand_density;
-    const lanes largest = hit > random ? hit : random;
-    const lanes sum = largest + log_lanes(exp_lanes(hit - largest) + exp_lanes(random - largest));
-    return largest == -INFINITY ? largest : sum;
-#else
-    return hit;
-#endif
-#endif
-}
+// in lanes: between field_square log_square
 
 #if FLOAT64
-// Poses of LANES particles: cells of the padded table, fractions of a cell less half of one, and directions.
-typedef struct {
-    ilanes col, row;
-    lanes x, y, cos, sin;
-} Particles;
+typedef Particles FieldParticles;
 
 // Set the pose of a lane. Half a cell is subtracted: interpolation is between centres.
-void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
-    ((lane_int *)&particle->col)[lane] = cell.x + FIELD_RING;
-    ((lane_int *)&particle->row)[lane] = cell.y + FIELD_RING;
-    ((real *)&particle->x)[lane] = pose.x - 0.5;
-    ((real *)&particle->y)[lane] = pose.y - 0.5;
-    ((real *)&particle->cos)[lane] = pose.z;
-    ((real *)&particle->sin)[lane] = pose.w;
+void place_particle(FieldParticles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+    set_particle(particle, lane, cell, pose, 0.5, 1);
 }
 
 // End points of a block of beams between four cell centres: the cell of the first, and the place between them.
@@ -57,7 +22,7 @@ typedef struct {
 
 // Find the places of a block's end points. Both cells of the ring hold the same value, so the four cells are neighbours
 // even beyond an edge.
-void find_places(EndPoints *ends, const Particles *particle, global const real2 *point, global const real2 *point_low,
+void find_places(EndPoints *ends, const FieldParticles *particle, global const real2 *point, global const real2 *point_low,
                  const int size, const Window window) {
     const int stride = window.cols + 2 * FIELD_RING;
     const lanes cos = particle->cos, sin = particle->sin;
@@ -72,21 +37,9 @@ void find_places(EndPoints *ends, const Particles *particle, global const real2 
     }
 }
 
-// Return the weighted sum of a and b; only weights and sums of EXACT_EXPONENT have two parts.
-LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
-#if EXACT_EXPONENT
-    return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
-#else
-    return (LanePair){weight_a.x * a.x + weight_b.x * b.x, 0};
-#endif
-}
-
 // Find the squares of the distances of a block's end points over 2 sigma^2.
 void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const FieldTerms *terms,
                   const int size, const Window window) {
-#if EXACT_EXPONENT
-    const LanePair scale = {terms->square_scale, terms->square_scale_low};
-#endif
     for (int k = 0; k < size; ++k) {
         const lane_int *at = (const lane_int *)&ends->cell[k];
         LanePair a = {0, 0}, b = {0, 0}, c = {0, 0}, d = {0, 0};
@@ -94,12 +47,7 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
         gather_pairs(table + window.cols + 2 * FIELD_RING, at, &c.x, &d.x);
         const LanePair low = between_lanes(ends->to_next_x[k], a, ends->rest_x[k], b);
         const LanePair high = between_lanes(ends->to_next_x[k], c, ends->rest_x[k], d);
-        const LanePair distance = between_lanes(ends->to_next_y[k], low, ends->rest_y[k], high);
-#if EXACT_EXPONENT
-        square[k] = pair_product_lanes(pair_product_lanes(distance, distance), scale);
-#else
-        square[k] = (LanePair){distance.x * (distance.x * terms->square_scale), 0};
-#endif
+        square[k] = field_square_lanes(between_lanes(ends->to_next_y[k], low, ends->rest_y[k], high), terms);
     }
 }
 #else
@@ -113,11 +61,11 @@ typedef double8 half_lanes;
 typedef struct {
     ilanes col, row;
     half_lanes x[2], y[2], cos[2], sin[2];
-} Particles;
+} FieldParticles;
 
 // Set the pose of a lane. Half a cell is subtracted since interpolation is between centres, and half a cell more, so that
 // rounding to nearest gives the cell below.
-void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+void place_particle(FieldParticles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
     ((int *)&particle->col)[lane] = cell.x + FIELD_RING;
     ((int *)&particle->row)[lane] = cell.y + FIELD_RING;
     ((double *)particle->x)[lane] = ((double)pose.x - 1) + pose_low.x;
@@ -148,7 +96,7 @@ lanes both_halves(const half_lanes *halves) {
 
 // Find the places of a block's end points. Both cells of the ring hold the same value, so the four cells are neighbours
 // even beyond an edge. An end point on a cell's edge may count to either side: the interpolated distance is the same.
-void find_places(EndPoints *ends, const Particles *particle, global const real2 *point, global const real2 *point_low,
+void find_places(EndPoints *ends, const FieldParticles *particle, global const real2 *point, global const real2 *point_low,
                  const int size, const Window window) {
     const int stride = window.cols + 2 * FIELD_RING;
     for (int k = 0; k < size; ++k) {
@@ -206,8 +154,7 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
 #else
         const lanes rest_x = ends->rest_x[k], rest_y = ends->rest_y[k], to_next_x = 1 - rest_x;
         const lanes low = to_next_x * a + rest_x * b, high = to_next_x * c + rest_x * d;
-        const lanes distance = (1 - rest_y) * low + rest_y * high;
-        square[k] = (LanePair){distance * (distance * terms->square_scale), 0};
+        square[k] = field_square_lanes((LanePair){(1 - rest_y) * low + rest_y * high, 0}, terms);
 #endif
     }
 }
@@ -217,26 +164,11 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
 #define SCALE_BITS 17
 #define FRACTION ((1 << SCALE_BITS) - 1)
 
-// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions; in float32 the latter two are
-// scaled by 2^SCALE_BITS.
-typedef struct {
-    ilanes col, row;
-    lanes x, y, cos, sin;
-} Particles;
+typedef Particles FieldParticles;
 
-// Set the pose of a lane.
-void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
-#if FLOAT64
-    const real scale = 1;
-#else
-    const real scale = 1 << SCALE_BITS;
-#endif
-    ((lane_int *)&particle->col)[lane] = cell.x + FIELD_RING;
-    ((lane_int *)&particle->row)[lane] = cell.y + FIELD_RING;
-    ((real *)&particle->x)[lane] = pose.x * scale;
-    ((real *)&particle->y)[lane] = pose.y * scale;
-    ((real *)&particle->cos)[lane] = pose.z * scale;
-    ((real *)&particle->sin)[lane] = pose.w * scale;
+// Set the pose of a lane; in float32, fractions and directions are scaled by 2^SCALE_BITS.
+void place_particle(FieldParticles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+    set_particle(particle, lane, cell, pose, 0, FLOAT64 ? 1 : 1 << SCALE_BITS);
 }
 
 #if FLOAT64
@@ -260,7 +192,7 @@ lanes held_lanes(const lanes i, const lanes last) {
 }
 
 // Find the cells of a block's end points.
-void find_cells(EndPoints *ends, const Particles *particle, global const real2 *point, const int size,
+void find_cells(EndPoints *ends, const FieldParticles *particle, global const real2 *point, const int size,
                 const Window window) {
     const real stride = window.cols + 2 * FIELD_RING;
     const lanes last_col = stride - 1, last_row = window.rows + 2 * FIELD_RING - 1;
@@ -293,7 +225,7 @@ real place_margin(global const real2 *point, const int size) {
 }
 
 // Find the scaled places of an end point, larger by margin than its coordinates.
-void scaled_places(const Particles *particle, global const real2 *point, const real margin, ilanes *x, ilanes *y) {
+void scaled_places(const FieldParticles *particle, global const real2 *point, const real margin, ilanes *x, ilanes *y) {
     // Two loads are faster than a load of two.
     global const real *to = (global const real *)point;
     const lanes cos = particle->cos, sin = particle->sin, to_x = to[0], to_y = to[1];
@@ -302,7 +234,7 @@ void scaled_places(const Particles *particle, global const real2 *point, const r
 }
 
 // Find the cells of a block's end points; return whether an end point may be within margin of a cell's edge.
-int find_cells(EndPoints *ends, const Particles *particle, global const real2 *point, const int size,
+int find_cells(EndPoints *ends, const FieldParticles *particle, global const real2 *point, const int size,
                const Window window, const real margin) {
     const uint stride = window.cols + 2 * FIELD_RING;
     const uint16 last_col = stride - 1, last_row = window.rows + 2 * FIELD_RING - 1;
@@ -321,7 +253,7 @@ int find_cells(EndPoints *ends, const Particles *particle, global const real2 *p
 }
 
 // Recompute the cells of end points that may be within margin of a cell's edge, with twice the digits.
-__attribute__((noinline)) void refine_cells(EndPoints *ends, const Particles *particle, const real margin,
+__attribute__((noinline)) void refine_cells(EndPoints *ends, const FieldParticles *particle, const real margin,
                                             const int first, const int count, global const int2 *pose_cell,
                                             global const real4 *pose, global const real4 *pose_low,
                                             global const real2 *point, global const real2 *point_low, const int size,

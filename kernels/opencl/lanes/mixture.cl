@@ -65,8 +65,8 @@ LanePair hit_scale_lanes(const lanes expected, global const MixtureTerms *terms,
 #if EXACT_EXPONENT
     const lanes growth = TERM(relative_growth), sum = multiply_add_lanes(growth, expected, (lanes)1), scale = 1 / sum;
     // Rounding error of the sum; below 2^24 the sum less 1 is exact.
-    const lanes excess = multiply_add_lanes(-TERM(relative_growth_low), expected, rest_lanes(growth, expected, sum - 1));
-    return (LanePair){scale, multiply_add_lanes(excess, scale, rest_lanes(sum, scale, (lanes)1))};
+    const lanes excess = multiply_add_lanes(-TERM(relative_growth_low), expected, rest_of_lanes(growth, expected, sum - 1));
+    return (LanePair){scale, multiply_add_lanes(excess, scale, rest_of_lanes(sum, scale, (lanes)1))};
 #else
     return (LanePair){1 / (1 + TERM(relative_growth) * expected), 0};
 #endif

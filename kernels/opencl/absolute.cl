@@ -45,12 +45,10 @@ real log_waves(const real2 residual, global const real *waves) {
     return log_one_plus(cosine * newer - older);
 }
 
-// Score positions: one work-item takes a particle. The exponent is (x_scale x)^2 + (shear x + y_scale y)^2, where (x, y)
-// is the offset from the reading to the sensor.
-kernel void score_position(ARGUMENTS) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-    const real2 x = place[n].xy, y = place[n].zw;
+// Return log p of a position, from the offset (x, y) from the reading to the sensor. The exponent is (x_scale x)^2 +
+// (shear x + y_scale y)^2.
+real log_position(const real4 off, global const PositionTerms *terms) {
+    const real2 x = (real2)(off.x, off.y), y = (real2)(off.z, off.w);
     const real2 x_scale = (real2)(terms->x_scale, terms->x_scale_low), y_scale = (real2)(terms->y_scale, terms->y_scale_low);
     const real2 shear = (real2)(terms->shear, terms->shear_low);
     const real2 first = bounded_square(pair_product(x, x_scale));
@@ -60,14 +58,17 @@ kernel void score_position(ARGUMENTS) {
 #if RAND
     log_density = either(log_density, terms->random);
 #endif
-    log_p[n] = temperature * log_density;
+    return log_density;
 }
 
-// Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
-kernel void score_heading(ARGUMENTS) {
+// Score positions: one work-item takes a particle.
+kernel void score_position(ARGUMENTS) {
     const int n = get_global_id(0);
-    if (n >= particles) return;
-    const real2 r = residual[n];
+    if (n < particles) log_p[n] = temperature * log_position(place[n], terms);
+}
+
+// Return log p of a heading, from the heading minus the reading, in [-pi, pi].
+real log_heading(const real2 r, global const HeadingTerms *terms, global const real *waves, const int kind) {
     real log_density;
     if (kind == SERIES) {
         log_density = terms->peak + (terms->peak_low + log_waves(r, waves));
@@ -80,5 +81,11 @@ kernel void score_heading(ARGUMENTS) {
 #if RAND
     log_density = either(log_density, terms->random);
 #endif
-    log_p[n] = temperature * log_density;
+    return log_density;
+}
+
+// Score headings: one work-item takes a particle.
+kernel void score_heading(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n < particles) log_p[n] = temperature * log_heading(residual[n], terms, waves, kind);
 }

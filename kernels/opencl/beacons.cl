@@ -56,17 +56,21 @@ real log_range(const real2 d, global const real *beacon, global const BeaconTerm
 #endif
 }
 
-// Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong to
-// a t.
-kernel void score_beacons(ARGUMENTS) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-    const real4 sensor = place[n];
-    real2 total = 0;
+// Return the sum of log p of the ranges over beacons. The first count numbers of the series belong to a t.
+real2 log_ranges(const real4 sensor, global const real *beacon, const int beacons, global const BeaconTerms *terms,
+                 global const real *series, const int count, const int kind) {
+    real2 total = (real2)(0, 0);
     for (int i = 0; i < beacons; ++i) {
         global const real *numbers = beacon + BEACON * i;
         const real2 d = distance_pair(offset((real4)(numbers[0], numbers[2], numbers[1], numbers[3]), sensor));
         total = add_term(total, log_range(d, numbers, terms, series, count, kind));
     }
-    log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
+    return total;
+}
+
+// Sum log p of the ranges over beacons: one work-item takes a particle.
+kernel void score_beacons(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    log_p[n] = scaled_sum(log_ranges(place[n], beacon, beacons, terms, series, count, kind), temperature);
 }

@@ -80,6 +80,12 @@ real2 add_term(const real2 total, const real term) {
     return (real2)(sum.x, total.y + sum.y);
 }
 
+// Return a compensated sum times a factor; an infinite sum has no second part.
+real scaled_sum(const real2 total, const real factor) {
+    const real sum = factor * (total.x + total.y);
+    return total.x - total.x == 0 ? sum : total.x;
+}
+
 // Return one pair of numbers where a comparison holds, and the other one elsewhere.
 real2 where_pair(const integer holds, const real2 one, const real2 other) {
     return (real2)(holds ? one.x : other.x, holds ? one.y : other.y);

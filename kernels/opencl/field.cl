@@ -48,7 +48,7 @@ real field_log(const real2 total, const real temperature) {
 #if CUBES
     return temperature * log(total.x + total.y);
 #else
-    return isinf(total.x) ? total.x : temperature * (total.x + total.y);
+    return scaled_sum(total, temperature);
 #endif
 }
 

@@ -85,7 +85,7 @@ kernel void field_gradient(ARGUMENTS) {
         add_slope(sums, slope, weight, at, to + (real2)(mount_x, mount_y), resolution);
     }
     global real *out = gradient + (long)GRADIENT_NUMBERS * n;
-    out[0] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
+    out[0] = scaled_sum(total, score.temperature);
     for (int i = 0; i < 6; ++i) out[1 + i] = score.temperature * sums[i];
     // The other rows of the symmetric information matrix.
     out[7] = score.temperature * sums[4];

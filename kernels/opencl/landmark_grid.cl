@@ -99,7 +99,7 @@ real log_match(const real4 off, const real4 turned, global const real *feature, 
 #if LINE
     return log_line(off, turned, feature, facing(normal[j], signature[j], turned), signature[j], terms, arcs);
 #else
-    return log_detection(off, turned, feature, signature[j], terms, arcs);
+    return log_detection(off, turned, feature, signature + j, terms, arcs);
 #endif
 }
 

@@ -85,10 +85,11 @@ real range_mass(const real2 d, const real scale, global const FeatureTerms *term
 #if FIELD
 // Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its ends.
 // Parts of the field more than half a turn away from the landmark are nearer in the other direction.
-real field_mass(const real2 angle, const real upper, const real upper_low, const real scale,
-                global const FeatureTerms *terms, global const real2 *arcs) {
+real field_mass(const real2 angle, global const real *feature, global const FeatureTerms *terms,
+                global const real2 *arcs) {
+    const real scale = feature[BEARING_SCALE];
     const real half_turn = arcs[ARC_STEPS + 2].x, whole = 2 * half_turn, field = terms->field_of_view;
-    real left = (upper - angle.x) + (upper_low - angle.y);
+    real left = (feature[UPPER] - angle.x) + (feature[UPPER_LOW] - angle.y);
     if (field / 2 - left > half_turn)
         left += whole;
     else if (field / 2 - left < -half_turn)
@@ -110,10 +111,19 @@ real2 add_square(const real2 total, const real2 residual, const real scale, cons
     return (real2)(more.x, isfinite(more.y) ? more.y : (real)0);
 }
 
-// Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
-real log_detection(const real4 off, const real4 turned, global const real *feature, const real4 signature,
+#if SIGNATURE
+// Add the square of the signature's error to an exponent; signature is (s_j, low part, -log m_s, 0).
+real2 add_signature(const real2 exponent, global const real *feature, global const real4 *signature) {
+    const real2 first = two_sum(feature[SIGNATURE_AT], -signature->x);
+    const real2 s = two_sum(first.x, first.y + (feature[SIGNATURE_LOW] - signature->y));
+    return add_square(exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW]);
+}
+#endif
+
+// Return log(z_detect p(f | j)) of one feature at an offset from a landmark with a signature.
+real log_detection(const real4 off, const real4 turned, global const real *feature, global const real4 *signature,
                    global const FeatureTerms *terms, global const real2 *arcs) {
-    real2 exponent = 0;
+    real2 exponent = (real2)(0, 0);
     real mass = 1, norm = 0;
     const real2 d = distance_pair(off);
 #if RANGE
@@ -126,26 +136,26 @@ real log_detection(const real4 off, const real4 turned, global const real *featu
 #endif
 #if BEARING
     if (feature[BEARING_SCALE] > 0) {
-        if (d.x > ZERO_RANGE) {
-            const real2 angle = angle_pair(across(off, turned), along(off, turned), arcs);
-            exponent = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
+        const integer has_bearing = d.x > ZERO_RANGE;
+        const real2 angle = angle_pair(across(off, turned), along(off, turned), arcs);
+        const real2 more = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
+        exponent = where_pair(has_bearing, more, exponent);
 #if FIELD
-            mass *= field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs);
+        const real seen = field_mass(angle, feature, terms, arcs);
+#else
+        const real seen = 1;
 #endif
-        } else {
-            // The density is 1 / field: the peak times zero_range_density and the scale.
-            mass *= terms->zero_range_density * feature[BEARING_SCALE];
-        }
+        // Without a bearing the density is 1 / field: the peak times zero_range_density and the scale.
+        const real anywhere = terms->zero_range_density * feature[BEARING_SCALE];
+        mass = mass * (has_bearing ? seen : anywhere);
     }
 #endif
 #if SIGNATURE
     if (feature[SIGNATURE_SCALE] > 0) {
-        const real2 first = two_sum(feature[SIGNATURE_AT], -signature.x);
-        const real2 s = two_sum(first.x, first.y + (feature[SIGNATURE_LOW] - signature.y));
-        exponent = add_square(exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW]);
-        norm = signature.z;
+        exponent = add_signature(exponent, feature, signature);
+        norm = signature->z;
     }
 #endif
     const real log_p = (feature[PEAK] - exponent.x) + ((feature[PEAK_LOW] - exponent.y) + norm);
-    return mass == 1 ? log_p : log_p - log(mass);
+    return in_any(mass != 1) ? log_p - log(mass) : log_p;
 }

@@ -62,17 +62,11 @@ real2 short_slopes(const real z, const real expected, global const MixtureTerms 
     return (real2)(1 - v - terms->lambda_short * z, v * (f - 1) - terms->lambda_short * z);
 }
 
-// Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
+// Add the terms of a pair to the sums, from responsibilities and slopes. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
 // r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle
 // of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2,
 // r_short s_l^2.
-void add_pair(const real z, const real expected, global const MixtureTerms *terms, global const real *masses,
-              real *sums) {
-    const real4 r = responsibilities(z, expected, terms, masses);
-    HitSlopes hit = {0, 0, 0, 0, 0, 0};
-    real2 shorter = (real2)(0);
-    if (r.y > 0) hit = hit_slopes(z, expected, terms, masses);
-    if (r.z > 0) shorter = short_slopes(z, expected, terms);
+void add_causes(const real z, const real4 r, const HitSlopes hit, const real2 shorter, real *sums) {
     sums[0] += r.x;
     sums[1] += r.y;
     sums[2] += r.z;
@@ -87,7 +81,8 @@ void add_pair(const real z, const real expected, global const MixtureTerms *term
     sums[11] += r.y * hit.square;
     sums[12] += r.z * z;
 #if INFORMATION
-    sums[13] += r.w > r.y && r.w > r.z ? 1 : 0;
+    const real one = 1, none = 0;
+    sums[13] += (r.w > r.y) & (r.w > r.z) ? one : none;
     const real y[6] = {r.y, r.z, r.w, r.y * hit.h_s, r.y * hit.h_m, r.z * shorter.x};
     int place = 14;
     for (int i = 0; i < 6; ++i)
@@ -97,6 +92,17 @@ void add_pair(const real z, const real expected, global const MixtureTerms *term
     sums[37] += r.y * hit.h_m * hit.h_m;
     sums[38] += r.z * shorter.x * shorter.x;
 #endif
+}
+
+// Add the terms of a pair to the sums.
+void add_pair(const real z, const real expected, global const MixtureTerms *terms, global const real *masses,
+              real *sums) {
+    const real4 r = responsibilities(z, expected, terms, masses);
+    HitSlopes hit = {0, 0, 0, 0, 0, 0};
+    real2 shorter = (real2)(0);
+    if (r.y > 0) hit = hit_slopes(z, expected, terms, masses);
+    if (r.z > 0) shorter = short_slopes(z, expected, terms);
+    add_causes(z, r, hit, shorter, sums);
 }
 
 // Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.

@@ -63,8 +63,8 @@ int whole(const real count) { return (int)((uint)as_bits(count) - FIRST); }
 
 // Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t. Only the
 // boundary nearest to the coordinate at t can be in doubt.
-real crossed(const real t, const real speed, const real a, const real inv, const int until) {
-    const real place = (t * speed - a) + COUNT, count = place > COUNT ? place : COUNT;
+real crossed(const real t, const real speed, const real a, const real inv, const integer until) {
+    const real least = COUNT, place = (t * speed - a) + COUNT, count = place > least ? place : least;
     const real here = ((count - COUNT) + a) * inv;
     return (here < t) | (until & (here == t)) ? count + 1 : count;
 }
@@ -115,11 +115,11 @@ int angle_bin(const real2 direction, const int bins) {
 // Convert a distance in cells to metres, exactly range_max where nothing is nearer, or with AMCL_LINES where nothing is
 // met.
 real expected_range(const real t, const RangeScale scale) {
-    const real range = t * scale.resolution;
+    const real range = t * scale.resolution, most = scale.range_max;
 #if AMCL_LINES
-    return t == scale.limit ? scale.range_max : range;
+    return t == scale.limit ? most : range;
 #else
-    return t >= scale.limit || range > scale.range_max ? scale.range_max : range;
+    return (t >= scale.limit) | (range > most) ? most : range;
 #endif
 }
 

@@ -51,6 +51,8 @@ WORLD_BY_WORLD = "a work-item moves pointers to its world; the reference takes a
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
 
 ON_PURPOSE = [
+    Purpose("absolute", "log_position log_heading", (OPENCL,), LANES),
+    Purpose("beacons", "log_ranges", (OPENCL,), LANES),
     Purpose("beam", "readings_of_scan", (WARP, NUMPY), "OpenCL moves pointers to a scan's beginning"),
     Purpose("beam", "strands_of", (WARP,), STAGES),
     Purpose("beam", "sum_terms", REFERENCE_ONLY, ARRAYS),
@@ -66,7 +68,7 @@ ON_PURPOSE = [
     Purpose("error_free", "floor_int", (OPENCL,), FLOOR),
     Purpose("error_free", "add_strands", KERNELS_ONLY, "the reference adds the terms of strand_sums"),
     Purpose("error_free", "strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
-    Purpose("error_free", "to_real", (OPENCL,), LANES),
+    Purpose("error_free", "to_real scaled_sum", (OPENCL,), LANES),
     Purpose("error_free", "where_pair", (OPENCL, NUMPY), LANES),
     Purpose("estimate", "add_pose", (OPENCL,), LANES),
     Purpose("field", "rounded_block", KERNELS_ONLY, QUICK),
@@ -108,6 +110,8 @@ ON_PURPOSE = [
     ),
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("landmarks", "add_signature", (OPENCL,), LANES),
+    Purpose("learning", "add_causes", (OPENCL,), LANES),
     Purpose("line_fit", "line_at", KERNELS_ONLY, ARRAYS),
     Purpose("log_terms", "in_any", (OPENCL,), LANES),
     Purpose("motion", "any_of motion_of move_by", (OPENCL,), LANES),

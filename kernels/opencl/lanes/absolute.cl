@@ -18,44 +18,23 @@ LanePair half_sine_lanes(const LanePair residual) {
     return two_sum_lanes(high, low + high * (z * series));
 }
 
-// in lanes: log_other_turns log_waves
+INLINE lanes log_position_lanes(const LaneQuad off, global const PositionTerms *terms);
+INLINE lanes log_heading_lanes(const LanePair r, global const HeadingTerms *terms, global const real *waves, const int kind);
+
+// in lanes: log_other_turns log_waves log_position log_heading
 
 // Score positions: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_position(ARGUMENTS) {
-    const int first_particle = LANES * get_global_id(0);
-    if (first_particle >= particles) return;
-    const LaneQuad offset = load_places(place, first_particle, particles);
-    const LanePair x = {offset.x, offset.y}, y = {offset.z, offset.w};
-    const LanePair x_scale = {terms->x_scale, terms->x_scale_low}, y_scale = {terms->y_scale, terms->y_scale_low};
-    const LanePair shear = {terms->shear, terms->shear_low};
-    const LanePair first = bounded_square_lanes(pair_product_lanes(x, x_scale));
-    const LanePair second =
-        bounded_square_lanes(pair_sum_lanes(pair_product_lanes(x, shear), pair_product_lanes(y, y_scale)));
-    const LanePair exponent = pair_sum_lanes(first, second);
-    lanes log_density = (terms->peak - exponent.x) + (terms->peak_low - exponent.y);
-#if RAND
-    log_density = either_lanes(log_density, (lanes)terms->random);
-#endif
-    store_some(temperature * log_density, log_p + first_particle, particles - first_particle);
+    const int first = LANES * get_global_id(0);
+    if (first >= particles) return;
+    const lanes found = temperature * log_position_lanes(load_places(place, first, particles), terms);
+    store_some(found, log_p + first, particles - first);
 }
 
 // Score headings: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_heading(ARGUMENTS) {
-    const int first_particle = LANES * get_global_id(0);
-    if (first_particle >= particles) return;
-    const LanePair r = load_pairs((global const real *)(residual + first_particle), particles - first_particle);
-    lanes log_density;
-    if (kind == SERIES) {
-        log_density = terms->peak + (terms->peak_low + log_waves_lanes(r, waves));
-    } else {
-        const LanePair root = kind == VON_MISES ? half_sine_lanes(r) : r;
-        const LanePair scale = {terms->scale, terms->scale_low};
-        const LanePair exponent = bounded_square_lanes(pair_product_lanes(root, scale));
-        log_density = (terms->peak - exponent.x) + (terms->peak_low - exponent.y);
-        if (kind == NEARBY) log_density += log_other_turns_lanes(r, terms->decay);
-    }
-#if RAND
-    log_density = either_lanes(log_density, (lanes)terms->random);
-#endif
-    store_some(temperature * log_density, log_p + first_particle, particles - first_particle);
+    const int first = LANES * get_global_id(0);
+    if (first >= particles) return;
+    const LanePair r = load_pairs((global const real *)(residual + first), particles - first);
+    store_some(temperature * log_heading_lanes(r, terms, waves, kind), log_p + first, particles - first);
 }

@@ -17,21 +17,13 @@ lanes atan_lanes(const lanes t) {
     return steep ? QUARTER_TURN - arc : arc;
 }
 
-// in lanes: STEEPEST ERF_ONE log_normal t_mass log_student_t log_range
+// in lanes: STEEPEST ERF_ONE log_normal t_mass log_student_t log_range log_ranges
 
 // Sum log p of the ranges over beacons: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_beacons(ARGUMENTS) {
-    const int first_particle = LANES * get_global_id(0);
-    if (first_particle >= particles) return;
-    const LaneQuad sensor = load_places(place, first_particle, particles);
-    LanePair total = {0, 0};
-    for (int i = 0; i < beacons; ++i) {
-        global const real *numbers = beacon + BEACON * i;
-        const real4 here = (real4)(numbers[0], numbers[2], numbers[1], numbers[3]);
-        const LanePair d = distance_pair_lanes(offset_lanes(in_all_lanes(here), sensor));
-        total = add_term_lanes(total, log_range_lanes(d, numbers, terms, series, count, kind));
-    }
-    const ilanes finite = total.x - total.x == 0;
-    const lanes all = finite ? temperature * (total.x + total.y) : total.x;
-    store_some(all, log_p + first_particle, particles - first_particle);
+    const int first = LANES * get_global_id(0);
+    if (first >= particles) return;
+    const LaneQuad sensor = load_places(place, first, particles);
+    const LanePair total = log_ranges_lanes(sensor, beacon, beacons, terms, series, count, kind);
+    store_some(scaled_sum_lanes(total, temperature), log_p + first, particles - first);
 }

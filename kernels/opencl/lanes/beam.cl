@@ -19,7 +19,7 @@ lanes ray_limit_lanes(const lanes z, global const MixtureTerms *terms, const Ran
 INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const MixtureTerms *terms,
                                         global const real *masses, global const real *edges, global const real *sensor,
                                         const MixtureTables tables, const RangeScale scale, ilanes *bin_at) {
-    const lanes expected = range_lanes(echo.t, scale);
+    const lanes expected = expected_range_lanes(echo.t, scale);
     *bin_at = 0;
 #if INCIDENCE
     for (int bin = 0; bin + 1 < tables.incidence_bins; ++bin)

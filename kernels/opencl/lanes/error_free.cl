@@ -13,7 +13,7 @@ typedef struct {
 
 lanes to_real_lanes(const ilanes i) { return to_lanes(i); }
 
-// in lanes: two_sum ordered_sum high_half two_product rest_of pair_sum pair_product add_term where_pair
+// in lanes: two_sum ordered_sum high_half two_product rest_of pair_sum pair_product add_term scaled_sum where_pair
 
 // Return a b + c, rounded once where the device has a fused multiply-add.
 lanes multiply_add_lanes(const lanes a, const lanes b, const lanes c) { return FUSES ? fma(a, b, c) : a * b + c; }

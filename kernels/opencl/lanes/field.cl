@@ -56,10 +56,9 @@ kernel void score_field(ARGUMENTS) {
         global const real *cells = table;
 #endif
         FieldParticles all[VECTORS];
-        lanes total[VECTORS], total_low[VECTORS];
+        LanePair total[VECTORS];
         for (int v = 0; v * LANES < count; ++v) {
-            total[v] = constant_term;
-            total_low[v] = 0;
+            total[v] = (LanePair){constant_term, 0};
             for (int i = 0; i < LANES; ++i) {
                 const int lane = v * LANES + i, n = base + (lane < count ? lane : count - 1);
                 place_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
@@ -91,7 +90,7 @@ kernel void score_field(ARGUMENTS) {
 #pragma unroll 4
 #endif
                 for (int k = 0; k < size; ++k) {
-                fetch_lines(&ahead, lines_of_step);
+                    fetch_lines(&ahead, lines_of_step);
 #if BILINEAR
                     const lanes term = log_square_lanes(square[k], terms);
 #else
@@ -104,19 +103,18 @@ kernel void score_field(ARGUMENTS) {
 #endif
                     block += term;
                 }
-                const lanes sum = total[v] + block, shift = sum - total[v];
-                total_low[v] += (total[v] - (sum - shift)) + (block - shift);
-                total[v] = sum;
+                total[v] = add_term_lanes(total[v], block);
             }
         }
-#if CUBES
-        for (int i = 0; i < count; ++i)
-            log_p[base + i] = score.temperature * log(((const real *)total)[i] + ((const real *)total_low)[i]);
-#else
         for (int v = 0; v * LANES < count; ++v) {
-            const lanes high = total[v], sum = score.temperature * (high + total_low[v]);
-            store_some(high - high == 0 ? sum : high, log_p + base + v * LANES, count - v * LANES);
-        }
+#if CUBES
+            const lanes sum = total[v].x + total[v].y;
+            for (int i = 0; i < LANES && v * LANES + i < count; ++i)
+                log_p[base + v * LANES + i] = score.temperature * log(((const real *)&sum)[i]);
+#else
+            const lanes sum = scaled_sum_lanes(total[v], score.temperature);
+            store_some(sum, log_p + base + v * LANES, count - v * LANES);
 #endif
+        }
     }
 }

@@ -46,7 +46,8 @@ kernel void field_gradient(ARGUMENTS) {
     const real power = terms->shape_power, rate = terms->shape_rate;
     // The sensor's place on the robot, turned.
     const lanes mounted_x = cos * mount_x - sin * mount_y, mounted_y = sin * mount_x + cos * mount_y;
-    lanes product = 1, total = constant_term, total_low = 0;
+    LanePair total = {constant_term, 0};
+    lanes product = 1;
     const int mask = peak + terms->rand_density < LARGEST_DENSITY && terms->rand_density > LEAST_DENSITY ? TOGETHER - 1 : 0;
     lanes sums[9];
     for (int i = 0; i < 9; ++i) sums[i] = 0;
@@ -75,9 +76,7 @@ kernel void field_gradient(ARGUMENTS) {
         const lanes density = hit + terms->rand_density;
         product *= density;
         if ((k & mask) == mask || k == size - 1) {
-            const lanes term = log_lanes(product), sum = total + term, shift = sum - total;
-            total_low += (total - (sum - shift)) + (term - shift);
-            total = sum;
+            total = add_term_lanes(total, log_lanes(product));
             product = 1;
         }
         const lanes weight = twice * (hit / density) * shape_weight_lanes(square, power, rate), pull = weight * distance;
@@ -97,10 +96,10 @@ kernel void field_gradient(ARGUMENTS) {
     const real one = score.temperature, cell = one / resolution, square = cell / resolution;
     const real scale[9] = {cell, cell, one, square, square, cell, square, cell, one};
     const int entry[12] = {0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8};
+    const lanes log_p = scaled_sum_lanes(total, score.temperature);
     for (int i = 0; i < count; ++i) {
         global real *out = gradient + (long)GRADIENT_NUMBERS * (begin + i);
-        const real high = ((const real *)&total)[i];
-        out[0] = isinf(high) ? high : score.temperature * (high + ((const real *)&total_low)[i]);
+        out[0] = ((const real *)&log_p)[i];
         for (int j = 0; j < 12; ++j) out[1 + j] = scale[entry[j]] * ((const real *)&sums[entry[j]])[i];
     }
 }

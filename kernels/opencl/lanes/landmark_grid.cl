@@ -61,7 +61,7 @@ ilanes may_be_likelier(const LaneQuad off, const lanes d, const LaneQuad turned,
 // does not measure, and may be likelier than the best so far.
 void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature, const int j,
                          const LaneQuad place, const LaneQuad turned, const lanes end_x, const lanes end_y,
-                         global const real *feature, global const FeatureTerms *terms) {
+                         global const real *feature, global const FeatureTerms *terms, global const real2 *arcs) {
     // The disc has room for these rounding errors.
     const real4 here = landmark[j];
     const lanes apart_x = here.x - end_x, apart_y = here.y - end_y;
@@ -79,12 +79,7 @@ void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global
     seen &= may_be_likelier(off, d, turned, match->best, feature);
 #endif
     if (!any_lane(seen)) return;
-#if SIGNATURE
-    const real4 known = signature[j];
-#else
-    const real4 known = 0;
-#endif
-    with_density_lanes(match, seen, log_detection_lanes(off, turned, feature, known, terms), j);
+    with_density_lanes(match, seen, log_detection_lanes(off, turned, feature, signature + j, terms, arcs), j);
 #if !MARGINAL
     const float reach = feature[REACH];
     if (reach > 0 && reach == feature[RANGE_AT]) {
@@ -110,7 +105,7 @@ int is_beyond(const real4 here, const real2 x, const real2 y, const float square
 void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature,
                           global const int *start, const int4 buckets, const int cols, const real2 x, const real2 y,
                           const LaneQuad place, const LaneQuad turned, const lanes end_x, const lanes end_y,
-                          global const real *feature, global const FeatureTerms *terms) {
+                          global const real *feature, global const FeatureTerms *terms, global const real2 *arcs) {
     const float squared_radius = feature[RADIUS] * feature[RADIUS];
     int nearest = -1;
 #if !MARGINAL
@@ -126,13 +121,15 @@ void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, globa
         }
     }
     if (nearest < 0) return;
-    with_landmark_lanes(match, landmark, signature, nearest, place, turned, end_x, end_y, feature, terms);
+    with_landmark_lanes(match, landmark, signature, nearest, place, turned, end_x, end_y, feature, terms,
+                        arcs);
 #endif
     for (int row = buckets.z; row <= buckets.w; ++row) {
         const int last = start[row * cols + buckets.y + 1];
         for (int j = start[row * cols + buckets.x]; j < last; ++j)
             if (j != nearest && !is_beyond(landmark[j], x, y, squared_radius))
-                with_landmark_lanes(match, landmark, signature, j, place, turned, end_x, end_y, feature, terms);
+                with_landmark_lanes(match, landmark, signature, j, place, turned, end_x, end_y, feature, terms,
+                        arcs);
     }
 }
 
@@ -140,7 +137,7 @@ void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, globa
 // alone, the particles search together, else one after the other. A lane has the same bits in both cases.
 MatchLanes search_lanes(global const real4 *landmark, global const real4 *signature, global const int *start,
                         const LaneQuad place, const LaneQuad turned, global const real *feature,
-                        global const FeatureTerms *terms, const Buckets buckets) {
+                        global const FeatureTerms *terms, global const real2 *arcs, const Buckets buckets) {
     const real radius = feature[RADIUS];
     MatchLanes match = {-INFINITY, -INFINITY, -1, -1, {0, 0}};
     if (radius < 0) return match;
@@ -152,7 +149,7 @@ MatchLanes search_lanes(global const real4 *landmark, global const real4 *signat
     if ((long)(all.y - all.x + 1) * (all.w - all.z + 1) <= TOGETHER * (long)across * up) {
         match.most = radius * radius;
         search_buckets_lanes(&match, landmark, signature, start, all, buckets.cols, x, y, place, turned, end_x, end_y,
-                             feature, terms);
+                             feature, terms, arcs);
     } else {
         real each_x[LANES], each_y[LANES];
         store_lanes(end_x, 0, each_x);
@@ -164,7 +161,8 @@ MatchLanes search_lanes(global const real4 *landmark, global const real4 *signat
             // No squared distance is negative, so the other lanes find nothing.
             match.most = active ? (lanes)(radius * radius) : (lanes)-1;
             search_buckets_lanes(&match, landmark, signature, start, touched, buckets.cols, x_only, y_only, place,
-                                 turned, end_x, end_y, feature, terms);
+                                 turned, end_x, end_y, feature, terms,
+                        arcs);
         }
     }
 #if MARGINAL

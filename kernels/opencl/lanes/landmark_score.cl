@@ -27,16 +27,11 @@ kernel void score_features(ARGUMENTS) {
             const LaneQuad turned = direction_lanes(heading, heading_low, numbers);
 #if KNOWN
             const int j = partner[k];
-#if SIGNATURE
-            const real4 known = signature[j];
-#else
-            const real4 known = 0;
-#endif
-            const lanes detected =
-                log_detection_lanes(offset_lanes(in_all_lanes(landmark[j]), place), turned, numbers, known, terms);
+            const LaneQuad off = offset_lanes(in_all_lanes(landmark[j]), place);
+            const lanes detected = log_detection_lanes(off, turned, numbers, signature + j, terms, arcs);
 #else
             const MatchLanes match =
-                search_lanes(landmark, signature, start, place, turned, numbers, terms, buckets);
+                search_lanes(landmark, signature, start, place, turned, numbers, terms, arcs, buckets);
             const lanes detected = match.log_p + share;
 #endif
             const lanes value = either_lanes(detected, (lanes)numbers[FALSE_POSITIVE]);

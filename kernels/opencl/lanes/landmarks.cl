@@ -24,7 +24,7 @@ LanePair difference_lanes(const float c, const float c_low, const LanePair a) {
 // in lanes: across along
 
 // Return the angle of an offset: its absolute value, in [0, pi]; with FIELD also its sign.
-LanePair angle_pair_lanes(const LanePair side, const LanePair ahead) {
+LanePair angle_pair_lanes(const LanePair side, const LanePair ahead, global const real2 *arcs) {
     const ilanes behind = ahead.x < 0, under = side.x < 0;
     const LanePair a = {behind ? -ahead.x : ahead.x, behind ? -ahead.y : ahead.y};
     const LanePair b = {under ? -side.x : side.x, under ? -side.y : side.y};
@@ -62,8 +62,9 @@ LanePair angle_pair_lanes(const LanePair side, const LanePair ahead) {
 #endif
 
 #if FIELD
-lanes field_mass_lanes(const LanePair angle, global const real *feature, const float field) {
-    const float scale = feature[BEARING_SCALE], whole = 2 * HALF_TURN;
+lanes field_mass_lanes(const LanePair angle, global const real *feature, global const FeatureTerms *terms,
+                       global const real2 *arcs) {
+    const float scale = feature[BEARING_SCALE], whole = 2 * HALF_TURN, field = terms->field_of_view;
     lanes left = (feature[UPPER] - angle.x) + (feature[UPPER_LOW] - angle.y);
     const lanes off = field / 2 - left;
     left = off > HALF_TURN ? left + whole : off < -HALF_TURN ? left - whole : left;
@@ -94,55 +95,14 @@ LanePair add_square_lanes(const LanePair total, const LanePair residual, const f
     return (LanePair){sum.x, low - low == 0 ? low : (lanes)0};
 }
 
-// Return log(z_detect p(f | j)) of a feature at an offset; signature is the landmark's.
-lanes log_detection_lanes(const LaneQuad off, const LaneQuad turned, global const real *feature,
-                          const real4 signature, global const FeatureTerms *terms) {
-    LanePair exponent = {0, 0};
-    lanes mass = 1;
 #if SIGNATURE
-    float norm = 0;
-#endif
-    const LanePair d = distance_pair_lanes(off);
-#if RANGE
-    if (feature[RANGE_SCALE] > 0) {
-        const float scale = feature[RANGE_SCALE];
-        const LanePair r = two_sum_lanes(d.x, (lanes)-feature[RANGE_AT]);
-        exponent = add_square_lanes(exponent, two_sum_lanes(r.x, r.y + (d.y - feature[RANGE_LOW])), scale,
-                                    feature[RANGE_SCALE_LOW]);
-        mass = range_mass_lanes(d, scale, terms);
-    }
-#endif
-#if BEARING
-    if (feature[BEARING_SCALE] > 0) {
-        const ilanes has_bearing = d.x > (float)ZERO_RANGE;
-        const LanePair angle = angle_pair_lanes(across_lanes(off, turned), along_lanes(off, turned));
-        const LanePair more =
-            add_square_lanes(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
-        exponent = (LanePair){has_bearing ? more.x : exponent.x, has_bearing ? more.y : exponent.y};
-#if FIELD
-        const lanes seen = field_mass_lanes(angle, feature, terms->field_of_view);
-#else
-        const lanes seen = 1;
-#endif
-        mass = mass * (has_bearing ? seen : (lanes)(terms->zero_range_density * feature[BEARING_SCALE]));
-    }
-#endif
-#if SIGNATURE
-    if (feature[SIGNATURE_SCALE] > 0) {
-        // The error of the signature is the same for all particles.
-        const real2 first = two_sum(feature[SIGNATURE_AT], -signature.x);
-        const real2 s = two_sum(first.x, first.y + (feature[SIGNATURE_LOW] - signature.y));
-        const real2 alone = add_square(0, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW]);
-        const LanePair more = two_sum_lanes(exponent.x, (lanes)alone.x);
-        const lanes low = more.y + (exponent.y + alone.y);
-        exponent = (LanePair){more.x, low - low == 0 ? low : (lanes)0};
-        norm = signature.z;
-    }
-#endif
-#if SIGNATURE
-    const lanes log_p = (feature[PEAK] - exponent.x) + ((feature[PEAK_LOW] - exponent.y) + norm);
-#else
-    const lanes log_p = (feature[PEAK] - exponent.x) + (feature[PEAK_LOW] - exponent.y);
-#endif
-    return any_lane(mass != 1) ? (mass == 1 ? log_p : log_p - log_lanes(mass)) : log_p;
+// The error of the signature is the same for all particles.
+LanePair add_signature_lanes(const LanePair exponent, global const real *feature, global const real4 *signature) {
+    const real2 alone = add_signature(0, feature, signature);
+    const LanePair more = two_sum_lanes(exponent.x, (lanes)alone.x);
+    const lanes low = more.y + (exponent.y + alone.y);
+    return (LanePair){more.x, low - low == 0 ? low : (lanes)0};
 }
+#endif
+
+// in lanes: log_detection

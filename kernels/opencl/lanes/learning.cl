@@ -8,7 +8,7 @@
 #define SUMS 13
 #endif
 
-// in lanes: hit_phi
+// in lanes: hit_phi HitSlopes add_causes
 
 // Add the terms of a pair in each lane to the sums of the lane.
 void add_pair_lanes(const lanes reading, const lanes expected_range, global const MixtureTerms *terms,
@@ -63,33 +63,17 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
 #else
     const ilanes moved = is_hit;
 #endif
-    const lanes h_s = is_hit ? square - 1 + t : (lanes)0, h_m = moved ? pull + slope : (lanes)0;
-    const lanes x = terms->lambda_short * expected, f = expected > SMALLEST_RANGE ? expected / length : (lanes)1, left = f - x;
-    const lanes s_l = is_short ? 1 - left - terms->lambda_short * z : (lanes)0;
-    sums[0] += known ? largest + log_lanes(p) : (lanes)0;
-    sums[1] += r_hit;
-    sums[2] += r_short;
-    sums[3] += r_rand;
-    sums[4] += r_hit * h_s;
-    sums[5] += r_hit * h_m;
-    sums[6] += r_short * s_l;
-    sums[7] += is_hit ? r_hit * (square * (bend - 2) - t + w + t * t) : (lanes)0;
-    sums[8] += moved ? r_hit * (pull * (bend - 2) - slope + q) : (lanes)0;
-    sums[9] += moved ? r_hit * (weight * (bend - 1) + v + slope * slope) : (lanes)0;
-    sums[10] += is_short ? r_short * (left * (f - 1) - terms->lambda_short * z) : (lanes)0;
-    sums[11] += is_hit ? r_hit * square : (lanes)0;
-    sums[12] += r_short * z;
-#if INFORMATION
-    sums[13] += (r_rand > r_hit) & (r_rand > r_short) ? (lanes)1 : (lanes)0;
-    const lanes y[6] = {r_hit, r_short, r_rand, r_hit * h_s, r_hit * h_m, r_short * s_l};
-    int place = 14;
-    for (int i = 0; i < 6; ++i)
-        for (int j = i; j < 6; ++j) sums[place++] += y[i] * y[j];
-    sums[35] += r_hit * h_s * h_s;
-    sums[36] += r_hit * h_s * h_m;
-    sums[37] += r_hit * h_m * h_m;
-    sums[38] += r_short * s_l * s_l;
-#endif
+    const HitSlopes_lanes slopes = {is_hit ? square : (lanes)0,
+                                    is_hit ? square - 1 + t : (lanes)0,
+                                    moved ? pull + slope : (lanes)0,
+                                    is_hit ? square * (bend - 2) - t + w + t * t : (lanes)0,
+                                    moved ? pull * (bend - 2) - slope + q : (lanes)0,
+                                    moved ? weight * (bend - 1) + v + slope * slope : (lanes)0};
+    const lanes x = terms->lambda_short * expected, f = expected > SMALLEST_RANGE ? expected / length : (lanes)1;
+    const lanes left = f - x, decay = terms->lambda_short * z;
+    const LanePair short_slopes = {is_short ? 1 - left - decay : (lanes)0, is_short ? left * (f - 1) - decay : (lanes)0};
+    const lanes log_p = known ? largest + log_lanes(p) : (lanes)0;
+    add_causes_lanes(z, (LaneQuad){log_p, r_hit, r_short, r_rand}, slopes, short_slopes, sums);
 }
 
 // Sum over blocks of pairs: one work-item takes a block of contiguous pairs (along is 1) that fill all lanes.

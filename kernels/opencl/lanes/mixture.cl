@@ -18,8 +18,6 @@
 // Return the larger numbers.
 lanes larger_lanes(const lanes a, const lanes b) { return a > b ? a : b; }
 
-// A density that were a call would pass vectors through memory, and load all constants again.
-#define INLINE inline __attribute__((always_inline))
 #define NOT_INLINE __attribute__((noinline))
 
 #if HIT

@@ -28,7 +28,7 @@ kernel void cast_ranges(ARGUMENTS) {
         const lanes limit = scale.limit;
 #endif
         const lanes t = cast_ray_lanes(map_table, seen, pose_cell[n], pose[n], x, y, limit, caster, &ahead);
-        const lanes range = range_lanes(t, scale);
+        const lanes range = expected_range_lanes(t, scale);
         if (first + LANES <= rays) {
             store_lanes(range, 0, out);
         } else {

@@ -34,26 +34,9 @@ void direct_lanes(const real4 pose, const lanes ray_x, const lanes ray_y, lanes 
     *dy = fabs(y) < TINY ? (lanes)0 : y;
 }
 
-// Count the boundaries whose distance is below t; with until also those at t.
-lanes crossed_lanes(const lanes t, const lanes speed, const lanes a, const lanes inv, const ilanes until) {
-    const lanes place = (t * speed - a) + COUNT, count = place > COUNT ? place : (lanes)COUNT;
-    const lanes here = ((count - COUNT) + a) * inv;
-    return ((here < t) | (until & (here == t))) ? count + 1 : count;
-}
-
-// in lanes: turn_of
+// in lanes: crossed turn_of expected_range
 
 ilanes angle_bin_lanes(const lanes dx, const lanes dy, const int bins) {
     const ilanes nearest = to_ilanes(turn_of_lanes(dx, dy) * (real)bins + (real)0.5);
     return nearest >= bins ? nearest - bins : nearest;
-}
-
-// Convert distances in cells to metres.
-lanes range_lanes(const lanes t, const RangeScale scale) {
-    const lanes range = t * scale.resolution;
-#if AMCL_LINES
-    return t == scale.limit ? (lanes)scale.range_max : range;
-#else
-    return ((t >= scale.limit) | (range > scale.range_max)) ? (lanes)scale.range_max : range;
-#endif
 }

@@ -4,6 +4,9 @@
 // There are 16 lanes of float32, or 8 of float64.
 // PoCL compiles any, fabs, fmax, min and max as calls, too slow for an inner loop: comparisons and masks replace them.
 
+// A density that were a call would pass vectors through memory, and load all constants again.
+#define INLINE inline __attribute__((always_inline))
+
 // Numbers at two places, with indices in memory that are not negative and share a load.
 #define AT_TWO(table, i, n) table[(uint)((const ulong *)(i))[n]], table[((const ulong *)(i))[n] >> 32]
 

@@ -10,6 +10,8 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from gpusense.interface import casters, constants, structs
 from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
@@ -187,7 +189,7 @@ def _definition(name: str, value: Any) -> str:
         return f"constant {kind} {name}[{len(value)}] = {{{', '.join(map(str, value))}}};\n"
     if isinstance(value, tuple):
         return "".join(f"#define {name}_{i} {number}\n" for i, number in enumerate(value))
-    return f"#define {name} {value}\n"
+    return f"#define {name} {value}{'f' if isinstance(value, np.float32) else ''}\n"
 
 
 def _blank(match: re.Match[str]) -> str:

@@ -5,8 +5,8 @@
 // Return the distance in cells to which the ray of a reading is cast.
 real ray_limit(const real z, global const MixtureTerms *terms, const RangeScale scale) {
 #if STOPS
-    const real last = last_range(z, terms) / scale.resolution;
-    return last < scale.limit ? last : scale.limit;
+    const real last = last_range(z, terms) / scale.resolution, limit = scale.limit;
+    return last < limit ? last : limit;
 #else
     return scale.limit;
 #endif

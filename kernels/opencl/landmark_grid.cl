@@ -77,9 +77,8 @@ int near(const real4 off, const real4 turned, global const real *feature, const 
 // be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and
 // 2 (1 - cos b) <= b^2. A factor and SLACK cover rounding errors of such distances.
 real squared_reach(const real exponent, global const real *feature) {
-    if (!(exponent > 0)) return 0;
-    const real r = sqrt(exponent) * feature[RANGE_SPREAD], b = sqrt(exponent) * feature[BEARING_SPREAD];
-    const real z = feature[RANGE_AT];
+    const real none = 0, root = sqrt(exponent > none ? exponent : none), z = feature[RANGE_AT];
+    const real r = root * feature[RANGE_SPREAD], b = root * feature[BEARING_SPREAD];
     return (real)1.01 * (r * r + z * (z + r) * (b * b)) + feature[SLACK];
 }
 

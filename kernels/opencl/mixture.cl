@@ -12,8 +12,8 @@
 // Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of p_rand, or
 // of p_short far from its end, whatever the distance of the obstacle.
 real last_range(const real z, global const MixtureTerms *terms) {
-    const real last = terms->last_offset + terms->last_slope * z;
-    return last > terms->last_least ? last : terms->last_least;
+    const real last = terms->last_offset + terms->last_slope * z, least = terms->last_least;
+    return last > least ? last : least;
 }
 #endif
 

@@ -8,9 +8,9 @@ import pytest
 from scipy import special
 
 from gpusense.evaluation.tolerances import TOLERANCES
-from gpusense.interface.kernel_files import opencl_source, warp_files
+from gpusense.interface.kernel_files import warp_files
 from gpusense.interface.signatures import LANES
-from gpusense.interface.sources import prelude, resolve
+from gpusense.interface.sources import assemble
 
 NORMAL = float(np.finfo(np.float32).tiny)
 COUNT = 1 << 22
@@ -49,13 +49,11 @@ def evaluate(needs):
         if double and not backend.info.float64:
             pytest.skip(f"{backend.info.name} has no float64")
         flags, lanes = frozenset({"FLOAT64"} if double else ()), LANES // 2 if double else LANES
-        files = [resolve(opencl_source(name), flags, name) for name in ("lanes/types", "lanes/math")]
         kernel = (
             "kernel void each(global const real *in, global real *out) {\n"
             f"    store_lanes({function}(load_lanes(get_global_id(0), in)), get_global_id(0), out);\n}}\n"
         )
-        source = prelude(float64=double) + "".join(files) + kernel
-        program = backend.programs.built(cl.Program(context, source))
+        program = backend.programs.built(cl.Program(context, assemble("lanes/math", flags) + kernel))
         given = cl.Buffer(context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=numbers)
         made, found = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, numbers.nbytes), np.empty_like(numbers)
         program.each(queue, (len(numbers) // lanes,), None, given, made)

@@ -5,15 +5,7 @@
 // processors mispredict; consecutive densities have no branch, so that processors compute several at once.
 #define VECTORS 4
 
-lanes ray_limit_lanes(const lanes z, global const MixtureTerms *terms, const RangeScale scale) {
-#if STOPS
-    const lanes reach = terms->last_offset + terms->last_slope * z;
-    const lanes last = (reach > terms->last_least ? reach : (lanes)terms->last_least) / scale.resolution;
-    return last < scale.limit ? last : (lanes)scale.limit;
-#else
-    return scale.limit;
-#endif
-}
+// in lanes: ray_limit
 
 // Return the components of the terms of readings in the sum; bin_at becomes where the terms of their bins begin.
 INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const MixtureTerms *terms,

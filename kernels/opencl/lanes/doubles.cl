@@ -19,12 +19,6 @@ doubles floor_lanes(const doubles x) {
     return x < INTEGERS ? below : x;
 }
 
-int any_of_lanes(const choices holds) {
-    const long4 four = holds.lo | holds.hi;
-    const long2 two = four.lo | four.hi;
-    return (two.x | two.y) != 0;
-}
-
 // Return the sum of all lanes; exact for integers whose sum is below 2^53.
 double sum_doubles(const doubles a) {
     const double4 four = a.lo + a.hi;

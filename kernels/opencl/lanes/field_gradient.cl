@@ -6,10 +6,6 @@
 #define TOGETHER 4
 #define LEAST_DENSITY 1e-9f
 #define LARGEST_DENSITY 1e9f
-// Numbers of a table and their right neighbours for eight of the indices in memory.
-#define NEIGHBOURS(table, i)                                                                                             \
-    ((float16)(vload2(0, table + i[0]), vload2(0, table + i[1]), vload2(0, table + i[2]), vload2(0, table + i[3]),       \
-               vload2(0, table + i[4]), vload2(0, table + i[5]), vload2(0, table + i[6]), vload2(0, table + i[7])))
 
 // A work-item takes LANES particles of one scan.
 kernel void field_gradient(ARGUMENTS) {
@@ -29,19 +25,15 @@ kernel void field_gradient(ARGUMENTS) {
 #endif
     const int count = left < LANES ? left : LANES;
     const int stride = window.cols + 2 * FIELD_RING, last_row = window.rows + 2 * FIELD_RING - 2;
-    global const real *above = table + stride;
-    ilanes col, row;
-    lanes x, y, cos, sin;
+    Particles some;
     for (int i = 0; i < LANES; ++i) {
         const int n = begin + (i < count ? i : count - 1);
-        ((int *)&col)[i] = pose_cell[n].x + FIELD_RING;
-        ((int *)&row)[i] = pose_cell[n].y + FIELD_RING;
         // Half a cell less: interpolation is between centres.
-        ((real *)&x)[i] = (pose[n].x - 0.5f) + pose_low[n].x;
-        ((real *)&y)[i] = (pose[n].y - 0.5f) + pose_low[n].y;
-        ((real *)&cos)[i] = pose[n].z;
-        ((real *)&sin)[i] = pose[n].w;
+        set_particle(&some, i, pose_cell[n], pose[n], 0.5f, 1);
+        ((real *)&some.x)[i] += pose_low[n].x, ((real *)&some.y)[i] += pose_low[n].y;
     }
+    const ilanes col = some.col, row = some.row;
+    const lanes x = some.x, y = some.y, cos = some.cos, sin = some.sin;
     const real peak = terms->hit_peak, twice = 2 * terms->square_scale;
     const real power = terms->shape_power, rate = terms->shape_rate;
     // The sensor's place on the robot, turned.
@@ -60,10 +52,9 @@ kernel void field_gradient(ARGUMENTS) {
         const ilanes c = within_lanes(col + to_col, stride - 2), r = within_lanes(row + to_row, last_row);
         const ilanes index = r * stride + c;
         const int *at = (const int *)&index;
-        const float16 below0 = NEIGHBOURS(table, at), below1 = NEIGHBOURS(table, (at + 8));
-        const float16 above0 = NEIGHBOURS(above, at), above1 = NEIGHBOURS(above, (at + 8));
-        const lanes a = (lanes)(below0.even, below1.even), b = (lanes)(below0.odd, below1.odd);
-        const lanes d = (lanes)(above0.even, above1.even), e = (lanes)(above0.odd, above1.odd);
+        lanes a, b, d, e;
+        gather_pairs(table, at, &a, &b);
+        gather_pairs(table + stride, at, &d, &e);
         const lanes low = a + rest_x * (b - a), high = d + rest_x * (e - d);
         const lanes slope_x = (b - a) + rest_y * ((e - d) - (b - a)), slope_y = high - low;
         const lanes distance = low + rest_y * slope_y;

@@ -42,6 +42,8 @@ void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p,
 }
 
 #if !MARGINAL
+// in lanes: squared_reach
+
 // Return the lanes in which a landmark at an offset may be likelier than the best so far. The error of the range and
 // the sine of the bearing's error bound the exponent from below; margins cover rounding errors, and landmarks without a
 // bearing at zero range.
@@ -83,9 +85,7 @@ void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global
 #if !MARGINAL
     const float reach = feature[REACH];
     if (reach > 0 && reach == feature[RANGE_AT]) {
-        const lanes rest = feature[MOST] - match->best, root = sqrt(rest > 0 ? rest : (lanes)0);
-        const lanes r = root * feature[RANGE_SPREAD], b = root * feature[BEARING_SPREAD];
-        const lanes far = 1.01f * (r * r + reach * (reach + r) * (b * b)) + feature[SLACK];
+        const lanes far = squared_reach_lanes(feature[MOST] - match->best, feature);
         match->most = far < match->most ? far : match->most;
     }
 #endif

@@ -2,26 +2,15 @@
 // vectors through memory; only float64 uses them. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
 //     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
 //     erf(x) = 1 - exp(-x W(x));   log erfc(x) = -x V(x);   arctan t = t + t^3 A(t^2).
-// bench/derive/lane_constants.py derives the constants; tests/kernels/test_lane_math.py measures the worst errors that
+// bench/derive/lane_constants.py derives the constants, those of E, L, A, W and V are in constants.py; tests/kernels/test_lane_math.py measures the worst errors that
 // stand below, in ulps of float32.
 // requires: lanes/types
 
 #if FLOAT64
 // From here on the error function is 1 to the last bit.
 #define LANE_ERF_ONE 6.0
-// Below this number 1 - e^a is a plain difference; reciprocals of factorials.
+// Below this number 1 - e^a is a plain difference.
 #define SERIES_END -0.25
-#define SERIES_3 (1.0 / 6.0)
-#define SERIES_4 (1.0 / 24.0)
-#define SERIES_5 (1.0 / 120.0)
-#define SERIES_6 (1.0 / 720.0)
-#define SERIES_7 (1.0 / 5040.0)
-#define SERIES_8 (1.0 / 40320.0)
-#define SERIES_9 (1.0 / 362880.0)
-#define SERIES_10 (1.0 / 3628800.0)
-#define SERIES_11 (1.0 / 39916800.0)
-#define SERIES_12 (1.0 / 479001600.0)
-#define SERIES_13 (1.0 / 6227020800.0)
 
 // Return e^a for a <= 0.
 lanes exp_lanes(const lanes a) { return exp(a); }
@@ -30,8 +19,9 @@ lanes exp_lanes(const lanes a) { return exp(a); }
 // PoCL's expm1 is a call, and takes longer.
 lanes one_minus_exp_lanes(const lanes a) {
     const lanes z = a * a;
-    const lanes odd = SERIES_3 + z * (SERIES_5 + z * (SERIES_7 + z * (SERIES_9 + z * (SERIES_11 + z * SERIES_13))));
-    const lanes even = 0.5 + z * (SERIES_4 + z * (SERIES_6 + z * (SERIES_8 + z * (SERIES_10 + z * SERIES_12))));
+    const lanes high = 1.0 / 362880 + z * (1.0 / 39916800 + z * (1.0 / 6227020800));
+    const lanes odd = 1.0 / 6 + z * (1.0 / 120 + z * (1.0 / 5040 + z * high));
+    const lanes even = 0.5 + z * (1.0 / 24 + z * (1.0 / 720 + z * (1.0 / 40320 + z * (1.0 / 3628800 + z * (1.0 / 479001600)))));
     return a < SERIES_END ? 1 - exp(a) : -(a + z * (even + a * odd));
 }
 
@@ -54,45 +44,6 @@ lanes erf_lanes(const lanes x) { return any_lane(x < LANE_ERF_ONE) ? erf(x) : (l
 #define ROOT_HALF 0x3f3504f3
 // From here on the error function is 1 to the last bit.
 #define LANE_ERF_ONE 4.0f
-// E, L, A, W and V, lowest power first. Their relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t), 2^-24.2 (of
-// erf) and 2^-24.4 (of 1 - log(erfc(x) / 2)).
-#define E0 0.49999997f
-#define E1 0.166665465f
-#define E2 0.041667223f
-#define E3 0.00836638454f
-#define E4 0.00138791779f
-#define L0 0.333333313f
-#define L1 -0.250008196f
-#define L2 0.200012267f
-#define L3 -0.166233569f
-#define L4 0.142017633f
-#define L5 -0.131601855f
-#define L6 0.127615467f
-#define L7 -0.0763445124f
-#define A0 -0.333333164f
-#define A1 0.199984789f
-#define A2 -0.14243634f
-#define A3 0.105943188f
-#define A4 -0.0607896857f
-#define W0 1.12837923f
-#define W1 0.636619389f
-#define W2 0.102777831f
-#define W3 -0.0191530641f
-#define W4 -0.000160394105f
-#define W5 0.00166702515f
-#define W6 -0.000632835436f
-#define W7 0.000117640826f
-#define W8 -9.25621225e-06f
-#define V0 1.12838185f
-#define V1 0.636580169f
-#define V2 0.102969967f
-#define V3 -0.0195953287f
-#define V4 0.000385133055f
-#define V5 0.00129188842f
-#define V6 -0.000495358487f
-#define V7 9.69315297e-05f
-#define V8 -1.02969989e-05f
-#define V9 4.69292473e-07f
 
 // Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
 lanes reduced_exp_lanes(const lanes a, ilanes *count) {

@@ -20,18 +20,26 @@ lanes larger_lanes(const lanes a, const lanes b) { return a > b ? a : b; }
 
 #define NOT_INLINE __attribute__((noinline))
 
+#if STOPS
+// in lanes: last_range
+#endif
+
 #if HIT
+#if BIAS
+// Return ranges clamped to [0, most].
+lanes clamped_lanes(const lanes range, const real most) {
+    const lanes raised = range < 0 ? (lanes)0 : range;
+    return raised > most ? (lanes)most : raised;
+}
+#endif
+
 // Return the means of p_hit; any_clamped becomes whether one is at an end of the range.
 INLINE lanes mean_range_lanes(const lanes expected, global const MixtureTerms *terms, const ilanes bin_at, int *any_clamped) {
     *any_clamped = 0;
 #if BIAS
     const lanes wanted = expected + TERM(range_bias);
     *any_clamped = any_lane((wanted < 0) | (wanted >= terms->range_max));
-    if (*any_clamped) {
-        const lanes raised = wanted < 0 ? (lanes)0 : wanted;
-        return raised > terms->range_max ? (lanes)terms->range_max : raised;
-    }
-    return wanted;
+    return *any_clamped ? clamped_lanes(wanted, terms->range_max) : wanted;
 #else
     return expected;
 #endif
@@ -41,11 +49,7 @@ INLINE lanes above_mean_lanes(const lanes expected, const int any_clamped, globa
 #if BIAS
     const LanePair last = two_sum_lanes((lanes)terms->range_max, -(lanes)(TERM(range_bias)));
     const lanes above = (last.x - expected) + (last.y - TERM(range_bias_low));
-    if (any_clamped) {
-        const lanes raised = above < 0 ? (lanes)0 : above;
-        return raised > terms->range_max ? (lanes)terms->range_max : raised;
-    }
-    return above;
+    return any_clamped ? clamped_lanes(above, terms->range_max) : above;
 #else
     return terms->range_max - expected;
 #endif
@@ -114,12 +118,8 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
     return (LanePair){product.x, product.y + (square.y * TERM(square_scale) + square.x * TERM(square_scale_low))};
 #endif
 #else
-#if GROWTH
     const lanes scaled = off.x * scale.x;
     return (LanePair){scaled * (scaled * TERM(square_scale)), 0};
-#else
-    return (LanePair){off.x * (off.x * TERM(square_scale)), 0};
-#endif
 #endif
 }
 
@@ -186,13 +186,8 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
-    lanes hit = TERM(hit_peak) * exp_lanes(-exponent.x);
-#if GROWTH
-    hit *= scale.x;
+    lanes hit = TERM(hit_peak) * exp_lanes(-exponent.x) * scale.x;
     const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.x, terms, masses, bin_at, &within);
-#else
-    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale), terms, masses, bin_at, &within);
-#endif
 #if EXACT_EXPONENT
     // The second part is arbitrary where the density underflows.
     hit = hit > 0 ? hit * (1 - exponent.y) : hit;
@@ -226,10 +221,8 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     lanes hit = (TERM(hit_peak) - exponent.x) + (TERM(hit_peak_low) - exponent.y);
 #if GROWTH
     hit += log_lanes(scale.x);
-    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.x, terms, masses, bin_at, &within);
-#else
-    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale), terms, masses, bin_at, &within);
 #endif
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.x, terms, masses, bin_at, &within);
     if (!within) hit = mass == 1 ? hit : hit - log_lanes(mass);
     parts.hit = hit;
 #endif

@@ -10,6 +10,13 @@
 // Numbers at two places, with indices in memory that are not negative and share a load.
 #define AT_TWO(table, i, n) table[(uint)((const ulong *)(i))[n]], table[((const ulong *)(i))[n] >> 32]
 
+// Return whether a comparison of 8 numbers of float64 holds in any lane.
+int any_of_lanes(const long8 holds) {
+    const long4 four = holds.lo | holds.hi;
+    const long2 two = four.lo | four.hi;
+    return (two.x | two.y) != 0;
+}
+
 #if FLOAT64
 typedef double8 lanes;
 typedef long8 ilanes;
@@ -17,6 +24,7 @@ typedef long lane_int;
 #define LANES 8
 #define as_ilanes as_long8
 #define as_lanes as_double8
+#define any_lane any_of_lanes
 #define load_lanes vload8
 #define store_lanes vstore8
 #define GATHER(type, table, i)                                                                                           \
@@ -40,13 +48,6 @@ lanes to_lanes(const ilanes i) { return as_lanes(i + LANE_INTEGER_BITS) - LANE_I
 ilanes to_ilanes(const lanes a) {
     const lanes shifted = a + LANE_INTEGERS;
     return as_ilanes(shifted) - LANE_INTEGER_BITS + (shifted - LANE_INTEGERS > a);
-}
-
-// Return whether a comparison holds in any lane.
-int any_lane(const ilanes holds) {
-    const long4 four = holds.lo | holds.hi;
-    const long2 two = four.lo | four.hi;
-    return (two.x | two.y) != 0;
 }
 
 // Return the sum of all lanes.

@@ -8,6 +8,8 @@ elementary.py.
 
 import warp as wp
 
+from gpusense.interface.constants import POLYNOMIALS
+
 from ..elementary import exp_of, log_of
 from ..flags import FLOAT64
 
@@ -33,13 +35,9 @@ MANTISSA = wp.int32(0x7FFFFF)
 ROOT_HALF = wp.int32(0x3F3504F3)
 # From here on the error function is 1 to the last bit.
 ERF_ONE = _number(4.0)
-# E, L and W, lowest power first.
-E0, E1, E2, E3, E4 = _numbers(0.49999997, 0.166665465, 0.041667223, 0.00836638454, 0.00138791779)
-L0, L1, L2, L3 = _numbers(0.333333313, -0.250008196, 0.200012267, -0.166233569)
-L4, L5, L6, L7 = _numbers(0.142017633, -0.131601855, 0.127615467, -0.0763445124)
-W0, W1, W2, W3 = _numbers(1.12837923, 0.636619389, 0.102777831, -0.0191530641)
-W4, W5, W6, W7 = _numbers(-0.000160394105, 0.00166702515, -0.000632835436, 0.000117640826)
-W8 = _number(-9.25621225e-06)
+E0, E1, E2, E3, E4 = _numbers(*POLYNOMIALS["E"])
+L0, L1, L2, L3, L4, L5, L6, L7 = _numbers(*POLYNOMIALS["L"])
+W0, W1, W2, W3, W4, W5, W6, W7, W8 = _numbers(*POLYNOMIALS["W"])
 
 
 @wp.func

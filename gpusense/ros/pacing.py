@@ -49,14 +49,16 @@ class Losses:
     """Count the messages of a topic that were lost, by the numbers of their publications.
 
     Each publisher has numbers of its own, and some releases of ROS do not name the publisher. A number follows the
-    nearest one at or below it.
+    nearest one at or below it. A middleware without numbers shows no losses.
     """
 
     def __init__(self) -> None:
         self._last: list[int] = []
 
-    def take(self, number: int) -> int:
+    def take(self, number: int | None) -> int:
         """Take the number of a message; return how many were lost before it."""
+        if number is None:
+            return 0
         before = max((each for each in self._last if number - _GAP < each <= number), default=None)
         if before is not None:
             self._last.remove(before)

@@ -158,8 +158,8 @@ def test_work_that_fails_rests_too() -> None:
     ([5, 6, 7], 0), ([5, 9], 3), ([5, 9, 10, 20], 12), ([500, 1, 2, 4], 1), ([1, 20_000], 0),
     # Two publishers, in turn and with losses; one that starts anew.
     ([1000, 10, 1001, 11, 1002, 12], 0), ([1000, 10, 1001, 13, 1005], 5), ([7, 7, 8, 8, 9, 9], 0),
-    ([1000, 10, 1001, 11, 1, 12, 2, 1002, 13], 0),
+    ([1000, 10, 1001, 11, 1, 12, 2, 1002, 13], 0), ([None, None, 2**64 - 1, 2**64 - 1], 0),
 ])  # fmt: skip
-def test_numbers_of_publications_show_losses(numbers: list[int], lost: int) -> None:
+def test_numbers_of_publications_show_losses(numbers: list[int | None], lost: int) -> None:
     losses = Losses()
     assert sum(map(losses.take, numbers)) == lost

@@ -46,12 +46,15 @@ def unreliable(depth: int) -> QoSProfile:
 
 
 def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the messages that wait at a subscription, each with its info.
+    """Yield the messages that wait at a subscription, each with its info, at most 1000.
 
     The executor takes one message of each topic in a round, so frequent topics lag behind costly callbacks.
     """
     with subscription.handle:
-        while (taken := subscription.handle.take_message(subscription.msg_type, False)) is not None:
+        for _ in range(_DEPTH):
+            taken = subscription.handle.take_message(subscription.msg_type, False)
+            if taken is None:
+                return
             yield taken
 
 

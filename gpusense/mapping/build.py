@@ -189,13 +189,12 @@ class MapBuilder:
         for one in np.unique(sensor):
             some = np.flatnonzero(sensor == one)
             scanner, rows = self._data.scanners[one], chosen[some]
-            ends = RayEnds(
+            ends = RayEnds.of_scans(
                 self._data.readings[one][place[some]], self._poses[rows], scanner,
                 min(self._limit, scanner.range_max), clear_max=self._clear_max,
                 motion=None if self._motion is None else self._motion[rows],
             )  # fmt: skip
-            ends.scan = some[ends.scan]
-            parts.append(ends)
+            parts.append(ends._replace(scan=some[ends.scan]))
         return parts[0] if len(parts) == 1 else RayEnds.joined(parts)
 
     def _scans_of(self, band: Window) -> np.ndarray:

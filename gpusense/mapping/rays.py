@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,19 +26,24 @@ LONGEST_RAY = 1 << 19
 """Most cells of a ray along an axis of the map: products of lengths in 1/4096 cell fit in 64 bits."""
 
 
-class RayEnds:
-    """Start and end in the world of each ray that carries information about the map.
+class RayEnds(NamedTuple):
+    """Start and end in the world of each ray that carries information about the map."""
 
-    Longer readings than ``range_limit`` clear cells up to it and mark no obstacle, and so do max readings if
-    ``clear_max``. ``motion`` (S, 3) is the robot's during the scans; None at rest.
+    start: np.ndarray  # (R, 2) [m]
+    end: np.ndarray  # (R, 2) [m]
+    hit: np.ndarray  # (R,) whether an obstacle is at the end
+    scan: np.ndarray  # (R,) index of the scan, ascending
 
-    ``start`` and ``end`` are (R, 2) [m], ``hit`` (R,) marks obstacles at the end, ``scan`` (R,) is the scan's index.
-    """
-
-    def __init__(
-        self, scans: np.ndarray, poses: np.ndarray, scanner: Scanner, range_limit: float, *, clear_max: bool,
+    @classmethod
+    def of_scans(
+        cls, scans: np.ndarray, poses: np.ndarray, scanner: Scanner, range_limit: float, *, clear_max: bool,
         motion: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
+    ) -> RayEnds:  # fmt: skip
+        """Return the rays of (S, K) readings at (S, 3) poses; ``motion`` (S, 3) is the robot's during scans, or None.
+
+        Longer readings than ``range_limit`` clear cells up to it and mark no obstacle, and so do max readings if
+        ``clear_max``.
+        """
         kinds = classify(scans, scanner)
         hit = (kinds == Reading.HIT) & (scans <= range_limit)
         used = (kinds == Reading.HIT) | (kinds == Reading.MAX) if clear_max else kinds == Reading.HIT
@@ -46,24 +52,21 @@ class RayEnds:
         poses = poses[scan] if motion is None else _poses_of_beams(poses, motion, scanner.count)[scan, beam]
         vectors = ray_vectors(scanner.bearings, scanner.mount)[beam]
         with np.errstate(over="ignore", invalid="ignore"):
-            self.start = poses[:, :2] + rotated(np.array([scanner.mount[:2]]), poses[:, 2])
-            self.end = self.start + length[:, None] * rotated(vectors, poses[:, 2])
-        self.hit, self.scan = hit[used], scan
+            start = poses[:, :2] + rotated(np.array([scanner.mount[:2]]), poses[:, 2])
+            end = start + length[:, None] * rotated(vectors, poses[:, 2])
+        return cls(start, end, hit[used], scan)
 
     @classmethod
     def joined(cls, parts: list[RayEnds]) -> RayEnds:
         """Return the rays of several parts in the order of their scans."""
-        result = cls.__new__(cls)
-        order = np.argsort(np.concatenate([part.scan for part in parts]), kind="stable")
-        for name in ("start", "end", "hit", "scan"):
-            setattr(result, name, np.concatenate([getattr(part, name) for part in parts])[order])
-        return result
+        whole = [np.concatenate(values) for values in zip(*parts, strict=True)]
+        order = np.argsort(whole[3], kind="stable")
+        return cls(*(values[order] for values in whole))
 
     def boxes(self, count: int, frame: GridFrame) -> np.ndarray:
         """Return the (S, 4) bounds of each scan's rays, columns and rows [cells], reversed infinities without rays."""
         both = np.stack([frame.to_cells(xy) for xy in (self.start, self.end)])
         boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (count, 1))
-        # Rays are sorted by scan.
         first = np.flatnonzero(np.diff(self.scan, prepend=-1))
         if len(first):
             of = self.scan[first]
@@ -81,31 +84,28 @@ def _poses_of_beams(poses: np.ndarray, motion: np.ndarray, beams: int) -> np.nda
     return np.stack([x, y, poses[:, 2, None] + heading], axis=-1)
 
 
-class CellRays:
-    """Rays that meet a window of a map, in cells of the window.
+def _in_cells(
+    ends: RayEnds, frame: GridFrame, window: Window, shape: tuple[int, int]
+) -> tuple[dict[str, np.ndarray], int]:
+    """Return the rays that meet a window of a map by the kernel's arguments, and how many end in its rows.
 
     Starts and ends have an int32 column and row (R, 2), relative to the window, and a position inside the cell [1/4096
-    cell]. ``hit`` (R,) is 1 where an obstacle is at the end. ``ending`` counts the rays that end, after clamping to the
-    map, in the rows of the window.
+    cell]. Ends are clamped to the map for counting them.
     """
-
-    def __init__(self, ends: RayEnds, frame: GridFrame, window: Window, shape: tuple[int, int]) -> None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            start, end = frame.to_cells(ends.start), frame.to_cells(ends.end)
-            low, high = np.minimum(start, end), np.maximum(start, end)
-            first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
-            # Enlarge the window by a cell for rounded coordinates.
-            meets = ((high >= np.subtract(first, 1)) & (low <= np.add(last, 1))).all(axis=1)
-            row = np.clip(end[:, 1], 0, shape[0] - 1)
-            self.ending = int(np.count_nonzero(meets & (row >= first[1]) & (row < last[1])))
-            places = [
-                np.rint(xy[meets] * (1 << RAY_BITS)).astype(np.int64) - (np.array(first) << RAY_BITS)
-                for xy in (start, end)
-            ]
-        (self.start_cell, self.start_inside), (self.end_cell, self.end_inside) = (
-            ((place >> RAY_BITS).astype(np.int32), (place & ((1 << RAY_BITS) - 1)).astype(np.int32)) for place in places
-        )
-        self.hit = ends.hit[meets].astype(np.int32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        start, end = frame.to_cells(ends.start), frame.to_cells(ends.end)
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
+        # Enlarge the window by a cell for rounded coordinates.
+        meets = ((high >= np.subtract(first, 1)) & (low <= np.add(last, 1))).all(axis=1)
+        row = np.clip(end[:, 1], 0, shape[0] - 1)
+        ending = int(np.count_nonzero(meets & (row >= first[1]) & (row < last[1])))
+        rays = {"hit": ends.hit[meets].astype(np.int32)}
+        for name, xy in (("start", start), ("end", end)):
+            place = np.rint(xy[meets] * (1 << RAY_BITS)).astype(np.int64) - (np.array(first) << RAY_BITS)
+            rays[f"{name}_cell"] = (place >> RAY_BITS).astype(np.int32)
+            rays[f"{name}_inside"] = (place & ((1 << RAY_BITS) - 1)).astype(np.int32)
+    return rays, ending
 
 
 def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
@@ -172,14 +172,13 @@ class BandCounts:
 
     def add(self, ends: RayEnds) -> None:
         """Count the cells of rays."""
-        rays = CellRays(ends, self._frame, self._band, self._shape)
-        self.rays += rays.ending
-        count = len(rays.hit)
+        rays, ending = _in_cells(ends, self._frame, self._band, self._shape)
+        self.rays += ending
+        count = len(rays["hit"])
         if count == 0:
             return
-        names = ("start_cell", "start_inside", "end_cell", "end_inside", "hit")
         with self._space as space:
-            placed = {name: space.upload(name, getattr(rays, name)) for name in names}
+            placed = {name: space.upload(name, values) for name, values in rays.items()}
             one = launch(
                 "count_rays", (), (count,), **placed, hits=self._hits, misses=self._misses, rows=self._band.rows,
                 cols=self._band.cols, rays=count,

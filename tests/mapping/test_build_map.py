@@ -19,6 +19,7 @@ from gpusense.world.grid import GridFrame
 from gpusense.world.windows import Window
 
 UNIT = 4096
+DEFAULTS = dict(range_limit=None, p_hit=0.85, p_miss=0.45, p_prior=0.5, occupied_threshold=65)
 
 
 def integer_cells(start, end):
@@ -120,9 +121,8 @@ def test_the_extent_holds_all_rays_and_a_map_is_built_in_steps():
     assert not (~grid.unknown)[[0, -1]].any() and not (~grid.unknown)[:, [0, -1]].any()
     assert all(value % 0.5 == 0 for value in grid.origin[:2])
     builder = MapBuilder(
-        *arguments, resolution=0.5, origin=None, shape=None, range_limit=None, clear_max=False, p_hit=0.85,
-        p_miss=0.45, p_prior=0.5, occupied_threshold=65, backend="numpy", each=2,
-    )  # fmt: skip
+        *arguments, **DEFAULTS, resolution=0.5, origin=None, shape=None, clear_max=False, backend="numpy", each=2
+    )
     known = [(~builder.grid().unknown).sum() for _ in builder.steps()]
     assert known[0] < known[1] and len(known) == 2 and builder.rays == 6
     assert builder.grid() == grid
@@ -184,9 +184,7 @@ def test_rays_from_far_do_not_bend(backend):
     assert misses.sum() > 150 and hits.sum() == 4
     starts, ends = (np.array([ray[k] for ray in FAR]) for k in (0, 1))
     counts = BandCounts(get_backend(backend), GridFrame(1.0, (0.0, 0.0, 0.0)), shape, Window(0, 0, *shape))
-    ends_of = object.__new__(RayEnds)
-    ends_of.start, ends_of.end, ends_of.hit, ends_of.scan = starts, ends, np.ones(len(FAR), bool), np.arange(len(FAR))
-    counts.add(ends_of)
+    counts.add(RayEnds(starts, ends, np.ones(len(FAR), bool), np.arange(len(FAR))))
     ((_, found_hits, found_misses),) = counts._counts()
     np.testing.assert_array_equal(found_misses.reshape(shape), misses)
     np.testing.assert_array_equal(found_hits.reshape(shape), hits)
@@ -218,8 +216,8 @@ def test_bands_of_rows_make_the_same_map(backend, yaw):
     scans, poses, scanner = world_of_scans()
     motion = np.column_stack([np.full(30, 0.1), np.zeros(30), np.full(30, 0.05)])
     options = dict(
-        resolution=0.1, origin=(0.5, 0.3, yaw), shape=(170, 190), range_limit=None, clear_max=True, p_hit=0.85,
-        p_miss=0.45, p_prior=0.5, occupied_threshold=65, backend=backend, motion=motion,
+        DEFAULTS, resolution=0.1, origin=(0.5, 0.3, yaw), shape=(170, 190), clear_max=True, backend=backend,
+        motion=motion,
     )  # fmt: skip
     maps, rays = [], []
     for most in (1 << 22, 190 * 40, 190 * 7 if yaw else 1):

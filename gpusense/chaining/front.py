@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Flags, Floats, Integers
-from gpusense.chaining.links import MATCH, Links, chained, filled_motion, partial_motion, relative, scan_motions
+from gpusense.chaining.links import (
+    MATCH,
+    Links,
+    chained,
+    filled_motion,
+    partial_motion,
+    relative,
+    runs_of,
+    scan_motions,
+)
 from gpusense.chaining.matcher import (
     GROUP,
     GUIDED_GROUP,
@@ -26,8 +35,8 @@ from gpusense.chaining.matcher import (
     matched_again,
     matched_by_motion,
     motions_around,
-    weakened,
 )
+from gpusense.matching.observability import spanning
 from gpusense.matching.result import ScanMatch
 from gpusense.world.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.world.scanner import Scanner
@@ -58,7 +67,7 @@ class Front:
     ) -> None:
         self.matcher = Matcher(readings, scanner, options)
         self.jumps = jumps_of(times, len(readings))  # (S,) whether the time jumps before a scan
-        self._odometry, self._times, self._options = odometry, times, options
+        self.odometry, self._times, self._options = odometry, times, options
         # (M,) indices of the matched scans; the robot has moved before each.
         self.nodes = moved_scans(odometry, readings, options.step)
         self.steps = np.zeros((0, 3))  # motions from each node to the next
@@ -78,11 +87,6 @@ class Front:
     def done(self) -> int:
         """Number of matched nodes."""
         return len(self.steps) + 1
-
-    @property
-    def has_odometry(self) -> bool:
-        """Return whether the log has odometry."""
-        return self._odometry is not None
 
     @property
     def links(self) -> Links:
@@ -120,42 +124,35 @@ class Front:
 
     def _by_odometry(self) -> Flags:
         """Return (M - 1,) whether the odometry agrees with each step."""
-        if self._odometry is None:
+        if self.odometry is None:
             return np.zeros(self.done - 1, bool)
-        reported = self._odometry[self.nodes[: self.done]]
+        reported = self.odometry[self.nodes[: self.done]]
         moved = pose_difference(reported[:-1], reported[1:])
         off = moved - self.steps
         agrees: Flags = np.hypot(off[:, 0], off[:, 1]) <= _AGREES + _AGREES_SHARE * np.hypot(moved[:, 0], moved[:, 1])
         return agrees & (np.abs(wrap_angle(off[:, 2])) <= _AGREES + _AGREES_SHARE * np.abs(moved[:, 2]))
 
-    def advance(self) -> bool:
-        """Match the next group; return whether there was one. An interrupt keeps the previous groups."""
+    def advance(self) -> None:
+        """Match the next group, if there is one. An interrupt keeps the previous groups."""
         trial = copy.copy(self)
         trial.keys, trial._parts = list(self.keys), list(self._parts)
-        found = trial._match_group()
+        group = GROUP if self.odometry is None else GUIDED_GROUP
+        begin, end = self.done, min(self.done + group, len(self.nodes))
+        if begin < end:
+            trial._follow(np.arange(begin, end))
+            trial._bridge(begin - 1, end - 1)
+            trial._choose_keys(begin, end)
+            trial._match_locally(end == len(self.nodes))
         # A single call, indivisible by signals.
         self.__dict__.update(trial.__dict__)
-        return found
-
-    def _match_group(self) -> bool:
-        """Match the next group; return whether there was one."""
-        group = GROUP if self._odometry is None else GUIDED_GROUP
-        begin, end = self.done, min(self.done + group, len(self.nodes))
-        if begin >= end:
-            return False
-        self._follow(np.arange(begin, end))
-        self._bridge(begin - 1, end - 1)
-        self._choose_keys(begin, end)
-        self._match_locally(end == len(self.nodes))
-        return True
 
     def _follow(self, part: Integers) -> None:
         first, second = self.nodes[part - 1], self.nodes[part]
         still = np.zeros((len(part), 3))
-        guess = still if self._odometry is None else pose_difference(self._odometry[first], self._odometry[second])
+        guess = still if self.odometry is None else pose_difference(self.odometry[first], self.odometry[second])
         found = self.matcher.match(first, second, guess)
         rival = np.full((len(part), 3), np.nan)
-        if self._odometry is None:
+        if self.odometry is None:
             found, rival = matched_by_motion(self.matcher, found, first, second, self._last)
         found = matched_again(self.matcher, found, first, second, guess)
         if self.matcher.motion is not None and self._times is not None:
@@ -168,10 +165,10 @@ class Front:
             found = found.replaced(np.arange(len(part)), again, again.usable)
         found = self.matcher.observed(first, second, found)
         usable = found.usable & (found.p_right >= SURE)
-        information = weakened(found.information, rival)
+        information = spanning(found.information, rival)
         links = Links.of(MATCH, part - 1, part, found.pose, information, found.p_right)
         self._parts.append(links[usable])
-        if self._odometry is None:
+        if self.odometry is None:
             good = usable & (found.eigenvalues > 0).all(axis=1)
             guess = motions_around(found.pose, good, self._last)[2]
             guess[self.jumps[second]] = 0.0
@@ -203,8 +200,7 @@ class Front:
                 compose_poses(invert_poses(others), pose) if before else compose_poses(pose, invert_poses(others))
             )
             self.p_right[rows], self.lost[rows], self.unseen[rows], self.bridged[rows] = p_right, 0, 0.0, True
-        edges = np.diff(np.concatenate([[False], self.p_right[begin:end] < SURE, [False]]).astype(int))
-        first, last = begin + np.flatnonzero(edges > 0), begin + np.flatnonzero(edges < 0)
+        first, last = (begin + place for place in runs_of(self.p_right[begin:end] < SURE))
         short = (last - first >= 2) & (last - first <= _GAP)
         runs, pose, _ = self._matched_over(first[short], last[short], np.flatnonzero(short))
         for run, moved in zip(runs, pose, strict=True):
@@ -220,7 +216,7 @@ class Front:
             return rows, np.zeros((0, 3)), np.zeros(0)
         nodes = self.nodes[first], self.nodes[second]
         match = self.matcher.match(*nodes, relative(self.poses, first, second))
-        if self._odometry is None:
+        if self.odometry is None:
             # Failed steps may be worse guesses than constant motion.
             steps = np.where((self.p_right < SURE)[:, None], self._expected, self.steps)
             guess = relative(chained(np.zeros(3), steps), first, second)
@@ -242,7 +238,7 @@ class Front:
     def _unseen_of(self, found: ScanMatch, usable: NDArray[np.bool]) -> Floats:
         """Return projections (L, 3, 3) of motions onto the directions that matches do not observe."""
         lost = found.eigenvalues == 0
-        if self._odometry is None:
+        if self.odometry is None:
             # A turn may end.
             lost &= np.abs(found.directions[:, :, 2]) < _TURNING
         directions = found.directions * lost[:, :, None]

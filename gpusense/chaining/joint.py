@@ -229,7 +229,7 @@ class Joint:
             steps = front.steps[step[chosen]]
             moved[chosen] = pose_difference(*(partial_motion(steps, share) for share in shares))
             unseen[chosen] = front.unseen[step[chosen]]
-        if not self.fronts[0].has_odometry:
+        if self.fronts[0].odometry is None:
             jumped, gaps = self.jumped(), np.diff(t)
             for k in np.flatnonzero(unseen.any(axis=(1, 2))):
                 ratio = gaps[k] / gaps[k - 1] if k and gaps[k - 1] > 0 else 0.0

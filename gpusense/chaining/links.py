@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
-from gpusense._util.typing import Floats, Integers
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.localization.motion import OdometryMotion, turns_between
 from gpusense.localization.motion_fit import fit_odometry_motion
 from gpusense.world.deskew import part_of_arc
@@ -98,6 +98,12 @@ def chained(first: Floats, steps: Floats) -> Floats:
     x = np.cumsum(np.append(first[0], c * steps[:, 0] - s * steps[:, 1]))
     y = np.cumsum(np.append(first[1], s * steps[:, 0] + c * steps[:, 1]))
     return np.stack([x, y, wrapped(heading)], axis=1)
+
+
+def runs_of(flags: Flags) -> tuple[Integers, Integers]:
+    """Return the first places (R,) of runs of true flags, and the places behind their last ones."""
+    edges = np.diff(np.concatenate([[False], flags, [False]]).astype(int))
+    return np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
 
 
 # Least deviations of a motion by odometry [m, rad], for finite information.

@@ -320,15 +320,6 @@ def _rivals(found: ScanMatch, seen: list[ScanMatch]) -> Floats:
     return rival
 
 
-def weakened(information: Floats, offset: Floats) -> Floats:
-    """Return information (L, 3, 3) that spans rivals at offsets (L, 3), by Woodbury's identity; NaN: no rival."""
-    offset = np.where(np.isfinite(offset), offset, 0.0)
-    side = np.einsum("lij,lj->li", information, offset)
-    total = 4 + (side * offset).sum(axis=1)
-    result: Floats = information - side[:, :, None] * (side / total[:, None])[:, None, :]
-    return result
-
-
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
     """Return the last good motion before each, the next good motion, and their mean, each (L, 3).
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats, Integers
 from gpusense.chaining.joint import Joint
-from gpusense.chaining.links import CLOSURE, Links
+from gpusense.chaining.links import CLOSURE, Links, runs_of
 from gpusense.localization.motion import OdometryMotion
 
 REASONS = {
@@ -138,7 +138,6 @@ def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
     }  # fmt: skip
     doubts = []
     for reason, flags in reasons.items():
-        edges = np.diff(np.concatenate([[False], flags, [False]]).astype(int))
-        for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-            doubts.append(Doubt(int(nodes[begin]), int(nodes[end]), reason))
+        first, last = (nodes[place].tolist() for place in runs_of(flags))
+        doubts += [Doubt(*ends, reason) for ends in zip(first, last, strict=True)]
     return tuple(sorted(doubts))

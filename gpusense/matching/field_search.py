@@ -211,23 +211,23 @@ class FieldSearch:
         def run(headings: slice, floor: int) -> Found:
             part = PoseGrid(start, searched.headings[:, headings], searched.height, searched.width)
             slack = TOP * len(cells) if floor >= 0 else len(cells)
-            return self._search.find([points], part, slack=slack, allowed=allowed, floor=floor)
+            found = self._search.find([points], part, slack=slack, allowed=allowed, floor=floor)
+            return replace(found, heading=found.heading + headings.start)
 
         everything = slice(0, searched.headings.shape[1])
         first = run(everything, -1)
         poses = self.grid._poses_to_world(searched.poses(first, self.stride))
         known = self._steps(model, ranges, len(cells), poses).max() - 1 - _ROUNDING * len(cells)
         # The modes may score less, but only the likeliest pose must not be missed.
-        parts = [(everything, run(everything, max(int(known) - most, 0)))]
+        parts = [run(everything, max(int(known) - most, 0))]
         evaluated = first.evaluated
-        if not parts[0][1].complete[0]:
-            evaluated += parts[0][1].evaluated
+        if not parts[0].complete[0]:
+            evaluated += parts[0].evaluated
             parts = list(_complete(run, everything, max(int(known), 0)))
-        evaluated += sum(part.evaluated for _, part in parts)
-        found = [np.concatenate(each) for each in zip(*[
-            (part.row, part.col, part.heading + headings.start) for headings, part in parts
-        ], strict=True)]  # fmt: skip
-        row, col, heading = found
+        evaluated += sum(part.evaluated for part in parts)
+        row, col, heading = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "col", "heading")
+        )
         (x, y), stride = searched.start[0], self.stride
         local = np.stack([x + stride * col, y + stride * row, searched.headings[0, heading]], axis=1)
         poses = self.grid._poses_to_world(local)
@@ -273,11 +273,11 @@ def log_likelihoods_of(
     return model.log_likelihood(poses[rows], ranges)
 
 
-def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -> Iterator[tuple[slice, Found]]:
+def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -> Iterator[Found]:
     """Yield searches of parts of the headings, in which every pose that reaches the floor is found."""
     found = run(headings, floor)
     if found.complete[0] or headings.stop - headings.start < 2:
-        yield headings, found
+        yield found
         return
     middle = (headings.start + headings.stop) // 2
     for part in (slice(headings.start, middle), slice(middle, headings.stop)):

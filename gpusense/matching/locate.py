@@ -5,19 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
-from gpusense.matching.field_search import (
-    field_search,
-    log_likelihoods_of,
-    padded_rows,
-    searchable,
-)
+from gpusense.matching.field_search import field_search, log_likelihoods_of, padded_rows, searchable
 from gpusense.matching.location import NAMES, Location, PoseMode, Status, location_evidence, probabilities_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.caster import RayCaster
@@ -37,31 +32,26 @@ _AGREE_SIGMAS, _AGREE_CELLS = 1.5, 3
 _COARSE, _COARSE_ANGLE, _LIKELY_DEPTH = 0.1, math.radians(3.0), 0.06
 
 
+class _Options(TypedDict, total=False):
+    """Options of :func:`locate_scan`."""
+
+    resolution: float
+    angle: float
+    positions: Literal["free", "all"]
+    modes: int
+    min_probability: float
+    refine: bool
+
+
 @overload
 def locate_scan(
-    model: LikelihoodFieldModel,
-    ranges: NDArray[Any] | Sequence[float],
-    *,
-    resolution: float = ...,
-    angle: float = ...,
-    positions: Literal["free", "all"] = ...,
-    modes: int = ...,
-    min_probability: float = ...,
-    refine: bool = ...,
+    model: LikelihoodFieldModel, ranges: NDArray[Any] | Sequence[float], **options: Unpack[_Options]
 ) -> Location: ...
 
 
 @overload
 def locate_scan(
-    model: LikelihoodFieldModel,
-    ranges: Sequence[ArrayLike],
-    *,
-    resolution: float = ...,
-    angle: float = ...,
-    positions: Literal["free", "all"] = ...,
-    modes: int = ...,
-    min_probability: float = ...,
-    refine: bool = ...,
+    model: LikelihoodFieldModel, ranges: Sequence[ArrayLike], **options: Unpack[_Options]
 ) -> tuple[Location, ...]: ...
 
 

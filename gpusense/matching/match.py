@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -187,9 +186,9 @@ def _by_noise(
     """Return the matches of all rows; rows with equal noise (S,) share one call."""
     levels = noise if len(noise) == 1 else np.unique(noise)
     if len(levels) < 2:
-        return matched(np.arange(len(noise)), replace(options, noise=float(levels[0])) if len(levels) else options)
+        return matched(np.arange(len(noise)), options.at_noise(float(levels[0])) if len(levels) else options)
     rows = [np.flatnonzero(noise == level) for level in levels]
-    parts = [matched(row, replace(options, noise=float(level))) for row, level in zip(rows, levels, strict=True)]
+    parts = [matched(row, options.at_noise(float(level))) for row, level in zip(rows, levels, strict=True)]
     return ScanMatch.joined(parts).ordered(np.argsort(np.concatenate(rows)))
 
 

@@ -17,9 +17,9 @@ from gpusense._util.typing import Floats
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.interface.constants import TOP
 from gpusense.matching.align import Alignment
-from gpusense.matching.pose_grid import distinct_poses
+from gpusense.matching.pose_grid import Found, PoseGrid, distinct_poses
 from gpusense.matching.score_tables import ScoreTables, field_scores
-from gpusense.matching.search import Found, PoseGrid, Search
+from gpusense.matching.search import Search
 from gpusense.tables.distances import distance_transform
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.pose_algebra import rotated

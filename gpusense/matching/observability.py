@@ -200,6 +200,18 @@ def _lost_basis(
     return basis
 
 
+def spanning(information: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return information (S, 3, 3) that also spans poses at offsets (S, 3), by Woodbury's identity; NaN: no such pose.
+
+    The covariance grows by a quarter of the offset's square.
+    """
+    offset = np.where(np.isfinite(offset), offset, 0.0)
+    side = np.einsum("sij,sj->si", information, offset)
+    total = 4 + (side * offset).sum(axis=1)
+    result: np.ndarray = information - side[:, :, None] * (side / total[:, None])[:, None, :]
+    return result
+
+
 def orthonormal(vectors: np.ndarray) -> np.ndarray:
     """Return orthonormal columns that span those of (S, 3, L); columns without a direction are 0."""
     u, s, _ = np.linalg.svd(vectors, full_matrices=False)

@@ -22,8 +22,6 @@ from gpusense.interface.structs import ScoreTable
 from gpusense.matching.pose_grid import Found, PoseGrid
 from gpusense.matching.score_tables import ScoreTables, cells_of
 
-__all__ = ["Found", "PoseGrid", "Search"]
-
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
 # Numbers that count the lines of a scan by their scores, as in the kernel file.
@@ -74,13 +72,16 @@ class Search:
         by row, column and heading. A scan without points scores 0 everywhere. No pose is returned without an allowed
         position.
         """
-        level, scans = self.first_level(points, grid) if level is None else level, len(points)
+        scans, info = len(points), self.tables.backend.info
+        if level is None:
+            level = self.tables.levels
+            sums = max(map(len, points)) * grid.headings.shape[1] * grid.height * grid.width
+            level -= level > 1 and sums >> (2 * level - 2) <= _MOST_SUMS[info.kind]
         if images is None and self.tables.shape.tables > 1:
             images = [np.full(len(part), scan) for scan, part in enumerate(points)]
         masks, slacks = self.masks(grid, allowed), np.broadcast_to(slack, scans)
         turns = grid.headings.shape[1]
         blocks = turns * -(-grid.height >> level) * -(-grid.width >> level)
-        info = self.tables.backend.info
         most = min(_MOST_BLOCKS[info.kind], info.memory // _MEMORY)
         each = max(min(_MOST_ITEMS // turns, most // blocks), 1)
         found = []
@@ -93,12 +94,6 @@ class Search:
             found.append(run.found())
         self.tables.drop_levels()
         return Found.joined(found)
-
-    def first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
-        """Return the level whose blocks are bounded first."""
-        level, most = self.tables.levels, _MOST_SUMS[self.tables.backend.info.kind]
-        sums = max(map(len, points)) * grid.headings.shape[1] * grid.height * grid.width
-        return level - 1 if level > 1 and sums >> (2 * level - 2) <= most else level
 
     def masks(self, grid: PoseGrid, allowed: np.ndarray | None) -> list[Buffer]:
         """Return masks of each level on the device; the last ones are kept."""

@@ -22,9 +22,10 @@ from gpusense.matching.icp_with_search import DOUBTFUL, is_held, match_pairs
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
+from gpusense.matching.pose_grid import PoseGrid
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
-from gpusense.matching.search import PoseGrid, Search
+from gpusense.matching.search import Search
 from gpusense.matching.verdicts import concluded, judged, observed_pairs, pair_evidence, pair_sums
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel

@@ -42,7 +42,14 @@ from gpusense.matching.columns import (
     values_of,
 )
 from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, PlacedPairs, points_of_line, space_of
-from gpusense.matching.observability import LEAST_PAIRS, Observed, axes_of, covariance_of, observed_information
+from gpusense.matching.observability import (
+    LEAST_PAIRS,
+    Observed,
+    axes_of,
+    covariance_of,
+    observed_information,
+    spanning,
+)
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch, is_usable
@@ -138,10 +145,7 @@ def concluded(
     usable, lever_column = is_usable(column_of(status)), column_of(lever)
     matrices, two = matrices_of(information), usable & has_rival(other)
     if any_of(two):
-        offset = np.where(upright(two), other, 0.0)
-        # The covariance plus a quarter of the offset's square, by Woodbury's identity.
-        side = np.einsum("sij,sj->si", matrices, offset)
-        matrices = matrices - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
+        matrices = spanning(matrices, np.where(upright(two), other, 0.0))
         status = np.where(values_of(two), "ambiguous", status)
     values, vectors = axes_of(matrices, lever_column)
     kept = (values, vectors) if all_of(usable) else None

@@ -38,7 +38,9 @@ BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 _PART, _LEAST, _LEAST_CELLS, _CLOSE = 0.02, 0.2, 2.0, 0.1
 # Numbers of a judgement.
 JUDGED = 2 * BEAMS
-_DOUBLE, _PLAIN, _STILL = np.dtype(np.float64), frozenset[str](), np.zeros((3, 3))
+_DOUBLE, _PLAIN = np.dtype(np.float64), frozenset[str]()
+KNOWN = np.zeros((3, 3))
+"""Covariance of a pose without deviations."""
 # Numbers of maps on devices, keys of recorded launches.
 _VERSIONS = itertools.count(1)
 
@@ -160,7 +162,7 @@ class MapJudge:
         self._uploaded: Floats | None = None
 
     def consistency(
-        self, scanner: Scanner, pose: Floats, ranges: Floats, covariance: Floats = _STILL
+        self, scanner: Scanner, pose: Floats, ranges: Floats, covariance: Floats = KNOWN
     ) -> BeamConsistency:
         """Judge the beams of a scan (K,), on host or device, at a (3,) pose with a (3, 3) covariance."""
         beams, kind, distance = self._judged(scanner, pose, covariance, ranges)
@@ -237,8 +239,18 @@ class MapJudge:
 
     def _set(self, scanner: Scanner) -> _Setting:
         """Return the setting of a scanner in the map."""
-        if self._setting is None or self._setting.scanner is not scanner:
-            self._setting = _setting_of(self.grid, scanner)
+        if self._setting is not None and self._setting.scanner is scanner:
+            return self._setting
+        grid, side = self.grid, self.grid.resolution
+        turn = math.remainder(scanner.mount[2] - grid.origin[2], math.tau)
+        rules = BeamRules(
+            max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
+            max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
+            grid.occupied_threshold,
+        )  # fmt: skip
+        nearest, _ = range_limits(_DOUBLE, scanner.range_min, scanner.range_max)
+        frame = frame_of(grid, scanner.mount)
+        self._setting = _Setting(scanner, nearest, turn, scanner.bearings + turn, frame, rules)
         return self._setting
 
 
@@ -255,15 +267,3 @@ def _finished(numbers: list[float]) -> list[float]:
     for place in (3, 6, 8):
         numbers[place] = max(numbers[place], 0.0)
     return numbers
-
-
-def _setting_of(grid: OccupancyGrid, scanner: Scanner) -> _Setting:
-    """Return the setting of a scanner in a map."""
-    side, turn = grid.resolution, math.remainder(scanner.mount[2] - grid.origin[2], math.tau)
-    rules = BeamRules(
-        max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
-        max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
-        grid.occupied_threshold,
-    )  # fmt: skip
-    nearest, _ = range_limits(_DOUBLE, scanner.range_min, scanner.range_max)
-    return _Setting(scanner, nearest, turn, scanner.bearings + turn, frame_of(grid, scanner.mount), rules)

@@ -30,7 +30,6 @@ _LEAST_TURN, _TURNS = math.radians(20), 72
 _ONE_PLACE, _ELSEWHERE, _CROWD = 1.5, 1.0, 0.3
 # Most points in the search for the place.
 _MOST_POINTS = 1000
-_STILL = np.zeros((3, 3))
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def diagnose(
     random_poses: Callable[[int], Floats] | None,
 ) -> Diagnosis:
     """Return the evidence of readings at a pose (3,); None for ``random_poses`` skips the search elsewhere."""
-    scans = sightings(sensors, readings, pose, _STILL)
+    scans = sightings(sensors, readings, pose)
     found = evidence_of(scans)
     if not found.counted and not (found.inside or found.off):
         return found
@@ -153,7 +152,7 @@ def diagnose(
     best = _best_elsewhere(sensors, readings, random_poses)
     if best is None or math.dist(best[:2], pose[:2]) < _ELSEWHERE:
         return found
-    if explains(sightings(sensors, readings, best, _STILL)):
+    if explains(sightings(sensors, readings, best)):
         x, y, theta = (float(value) for value in best)
         return replace(found, elsewhere=(x, y, theta), cause="start")
     return replace(found, cause="map")
@@ -191,22 +190,18 @@ def _mount(
 ) -> tuple[float | None, bool]:
     """Return the turn that makes scans fit at a pose (or None), and whether they are mirrored."""
     best: tuple[float, float | None, bool] = (0.0, None, False)
+    scans = {index: reading[0] for index, reading in readings.items() if sensors[index].calibrates}
     for mirrored in (False, True):
-        seen = _mirrored(sensors, readings) if mirrored else readings
+        seen = {index: (ranges[::-1] if mirrored else ranges,) for index, ranges in scans.items()}
         for k in range(_TURNS):
             angle = math.remainder(k * math.tau / _TURNS, math.tau)
             if not mirrored and abs(angle) < _LEAST_TURN:
                 continue
-            scans = sightings(sensors, seen, pose + np.array([0.0, 0.0, angle]), _STILL)
-            agree = counts_of(scans).agree
-            if agree > best[0] and explains(scans):
+            found = sightings(sensors, seen, pose + np.array([0.0, 0.0, angle]))
+            agree = counts_of(found).agree
+            if agree > best[0] and explains(found):
                 best = agree, angle, mirrored
     return best[1], best[2]
-
-
-def _mirrored(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]]) -> dict[int, tuple[Any, ...]]:
-    """Return the scans among readings with ranges in reverse order."""
-    return {index: (reading[0][::-1], *reading[1:]) for index, reading in readings.items() if sensors[index].calibrates}
 
 
 def _best_elsewhere(

@@ -130,8 +130,8 @@ class FilterCore:
         """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""
         tracker = self.tracker
         tracker.move()
-        tries = tracker.random_poses(starts.tries_of(tracker.cloud.count))
-        likely = starts.likeliest(tries, tracker.cloud.count, self.sensors, self.last, self.options.temperature)
+        count, temperature = tracker.cloud.count, self.options.temperature
+        likely = starts.likeliest(tracker.random_poses, count, self.sensors, self.last, temperature)
         moved = compose_poses(likely, tracker.progress.moved or np.zeros(3))
         tracker.place(starts.with_poses(tracker.next_particles(), moved, tracker.key()))
 

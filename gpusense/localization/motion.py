@@ -23,6 +23,8 @@ from gpusense.world.parameters import _Parameters
 SHORTEST = 0.01
 # Largest turn of a step and largest deviation of turns [rad]; kernels limit headings to LARGEST_HEADING.
 _MOST_TURNED = 1e5
+# Arguments of ``predict`` for models of odometry.
+_ODOMETRY = "the odometry before and after the step"
 
 
 class SampledMotion(NamedTuple):
@@ -108,18 +110,20 @@ def turns_between(before: Sequence[float], after: Sequence[float]) -> tuple[floa
     return first, trans, math.remainder(turn - first, math.tau)
 
 
-def _alphas(alpha: object, count: int) -> tuple[float, ...]:
-    values = checks.array("alpha", alpha, (count,))
-    if values.size and values.min() < 0:
-        raise ValueError(f"alpha: must be >= 0, got {values.min()}")
-    return tuple(float(value) for value in values)
+def _check_noise(model: OdometryMotion | OmniMotion | VelocityMotion, count: int) -> None:
+    """Check the ``count`` numbers ``alpha`` of a model and its two least deviations, and make them tuples of floats."""
+    for name, size in (("alpha", count), ("least", 2)):
+        values = checks.array(name, getattr(model, name), (size,))
+        if values.min() < 0:
+            raise ValueError(f"{name}: must be >= 0, got {values.min()}")
+        object.__setattr__(model, name, tuple(values.tolist()))
 
 
-def _least(least: object) -> tuple[float, float]:
-    values = checks.array("least", least, (2,))
-    if values.min() < 0:
-        raise ValueError(f"least: must be >= 0, got {values.min()}")
-    return float(values[0]), float(values[1])
+def _two_of(arguments: tuple[Any, ...], what: str) -> tuple[Any, Any]:
+    """Return the two arguments of ``predict``."""
+    if len(arguments) != 2:
+        raise TypeError(f"predict: must have {what}, got {len(arguments)} values")
+    return arguments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,18 +158,15 @@ class OdometryMotion(_Parameters):
     sideways: float = DEFAULTS.sideways
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "alpha", _alphas(self.alpha, 4))
-        object.__setattr__(self, "least", _least(self.least))
+        _check_noise(self, 4)
         self._check("reverse", low=0, high=1)
         self._check("sideways", low=0)
         missed = checks.array("systematic", self.systematic, (3,))
-        object.__setattr__(self, "systematic", tuple(float(value) for value in missed))
+        object.__setattr__(self, "systematic", tuple(missed.tolist()))
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
-        if len(arguments) != 2:
-            raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
-        return self.sampled_turns(*odometry_turns(*arguments))
+        return self.sampled_turns(*odometry_turns(*_two_of(arguments, _ODOMETRY)))
 
     def sampled_turns(self, first: float, trans: float, second: float) -> SampledMotion:
         """Return the numbers of a step from its motion; see :func:`odometry_turns`."""
@@ -207,14 +208,12 @@ class OmniMotion:
     least: tuple[float, float] = DEFAULTS.least
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "alpha", _alphas(self.alpha, 5))
-        object.__setattr__(self, "least", _least(self.least))
+        _check_noise(self, 5)
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
-        if len(arguments) != 2:
-            raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
-        x, y, turn = _difference(_odometer("before", arguments[0]), _odometer("after", arguments[1]))
+        before, after = _two_of(arguments, _ODOMETRY)
+        x, y, turn = _difference(_odometer("before", before), _odometer("after", after))
         trans = math.hypot(x, y)
         direction = math.atan2(y, x) if trans > 0 else 0.0
         a1, a2, a3, a4, a5 = self.alpha
@@ -249,15 +248,13 @@ class VelocityMotion:
     least: tuple[float, float] = DEFAULTS.least
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "alpha", _alphas(self.alpha, 6))
-        object.__setattr__(self, "least", _least(self.least))
+        _check_noise(self, 6)
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from velocities and a duration."""
-        if len(arguments) != 2:
-            raise TypeError(f"predict: must have velocities and a duration, got {len(arguments)} values")
-        v, w = (float(value) for value in checks.array("velocity", arguments[0], (2,), largest=checks.FARTHEST))
-        seconds = checks.real("seconds", arguments[1], low=0, high=checks.FARTHEST)
+        velocity, duration = _two_of(arguments, "velocities and a duration")
+        v, w = checks.array("velocity", velocity, (2,), largest=checks.FARTHEST).tolist()
+        seconds = checks.real("seconds", duration, low=0, high=checks.FARTHEST)
         if abs(w * seconds) > _MOST_TURNED:
             raise ValueError(f"velocity: must turn by at most {_MOST_TURNED:g} rad in a step, got {w * seconds}")
         a1, a2, a3, a4, a5, a6 = self.alpha

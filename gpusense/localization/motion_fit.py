@@ -140,7 +140,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
     moved, wrong = _reverse(turns, reference, at)
     repeated = np.zeros(3)
     errors = errors_of(turns, reference, at)
-    noise, cost = _fitted(errors, [_start(0.001), _start(0.02)])
+    noise, cost = _fitted(errors, [np.array([alpha] * 5 + list(_DEFAULT[5:])) for alpha in (0.001, 0.02)])
     for _ in range(_ROUNDS if systematic else 0):
         repeated = repeated + _systematic(noise, errors, repeated)
         errors = errors_of(corrected(turns, repeated), reference, at)
@@ -185,11 +185,6 @@ def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[
     flipped = _distance(taken * (1, -1, 1), truth) < _distance(taken, truth) - _CLEAR
     turns[steps[flipped], 1] *= -1
     return int(np.count_nonzero(2 * np.abs(taken[:, 1]) > _CLEAR)), int(flipped.sum())
-
-
-def _start(alpha: float) -> np.ndarray:
-    """Return initial variances of a search: alpha1 to alpha4, ``sideways``, and ``least`` [m^2, rad^2]."""
-    return np.array([alpha] * 5 + list(_DEFAULT[5:]))
 
 
 def _motion(noise: np.ndarray, reverse: float, repeated: np.ndarray) -> OdometryMotion:

@@ -43,7 +43,7 @@ DEFAULTS: dict[str, Any] = {
     "set_initial_pose": False, "sigma_hit": 0.2, "tf_broadcast": True, "transform_tolerance": 1.0,
     "update_min_a": 0.2, "update_min_d": 0.25, "z_hit": 0.5, "z_max": 0.05, "z_rand": 0.5, "z_short": 0.05,
 }  # fmt: skip
-_RECOVERY = ("recovery_alpha_slow", "recovery_alpha_fast")
+_SKIPS, _RECOVERY = "beam_skip_threshold", ("recovery_alpha_slow", "recovery_alpha_fast")
 _MODELS = ("beam", "likelihood_field", "likelihood_field_prob")
 _ROBOTS = {
     "nav2_amcl::DifferentialMotionModel": "differential", "nav2_amcl::OmniMotionModel": "omni",
@@ -211,7 +211,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         pf_z=checks.real("pf_z", values["pf_z"], above=0),
         resample_interval=checks.integer("resample_interval", values["resample_interval"], low=1),
         recovery=cast(Any, tuple(checks.real(key, values[key], low=0, high=1) for key in _RECOVERY)),
-        beam_skip=_beam_skip(values),
+        beam_skip=checks.real(_SKIPS, values[_SKIPS], above=0, below=1) if values["do_beamskip"] else None,
         update_min=(values["update_min_d"], values["update_min_a"]),
         max_beams=checks.integer("max_beams", values["max_beams"], low=1),
         range_limits=(near if near >= 0 else None, far if far > 0 else None),
@@ -272,13 +272,6 @@ def _particles(values: Mapping[str, Any]) -> tuple[int, int]:
     if least > most:
         raise ValueError(f"min_particles: must be <= max_particles = {most}, got {least}")
     return least, most
-
-
-def _beam_skip(values: Mapping[str, Any]) -> float | None:
-    """Return the share of the particles that must explain a beam; None without beam skipping."""
-    if not values["do_beamskip"]:
-        return None
-    return checks.real("beam_skip_threshold", values["beam_skip_threshold"], above=0, below=1)
 
 
 def _weights(model: str, v: Mapping[str, Any]) -> BeamWeights | FieldWeights:

@@ -43,7 +43,7 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
     if any(key in content for key in (*known, *ROS_1)):
         if node is not None:
             raise ValueError(f"node: must be None where source has the parameters themselves, got {checks.show(node)}")
-        _check_names(content, name)
+        _refuse_ros_1(content, name)
         return _dotted(content, name)
     nodes = list(nodes_of(content))
     wanted = "amcl" if node is None else node.strip("/")
@@ -56,7 +56,8 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
     matching = [(path, _dotted(own, name)) for path, own in nodes if _matches(path, full)]
     if matching:
         found = _merged(matching, full, name)
-        _warn_of_ros_1(found, name)
+        if old := _ros_1_names(found):
+            warnings.warn(f"{name}: names of ROS 1's amcl have no effect in ROS 2: {old}", stacklevel=2)
         return {key: value for key, value in found.items() if not exact or key in known or key in matching[-1][1]}
     if node is not None or any("*" in path for path, _ in nodes):
         paths = sorted(path for path, _ in nodes)
@@ -66,7 +67,7 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
     if "odometry_motion" in content:
         return {}
     if isinstance(content.get("amcl"), Mapping):
-        _check_names(content["amcl"], name)
+        _refuse_ros_1(content["amcl"], name)
     raise ValueError(f"{name}: must hold amcl's {_OWN}, got the keys {checks.show(sorted(map(str, content)))}")
 
 
@@ -104,16 +105,10 @@ def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) ->
     return found
 
 
-def _check_names(values: Mapping[Any, Any], name: str) -> None:
+def _refuse_ros_1(values: Mapping[Any, Any], name: str) -> None:
     """Refuse parameter names of ROS 1, since the defaults differ."""
     if old := _ros_1_names(values):
         raise ValueError(f"{name}: must have amcl's names in ROS 2, got names of ROS 1: {old}")
-
-
-def _warn_of_ros_1(values: Mapping[Any, Any], name: str) -> None:
-    """Warn of parameter names of ROS 1, which nav2_amcl ignores."""
-    if old := _ros_1_names(values):
-        warnings.warn(f"{name}: names of ROS 1's amcl have no effect in ROS 2: {old}", stacklevel=2)
 
 
 def _ros_1_names(values: Mapping[Any, Any]) -> str:

@@ -143,14 +143,10 @@ class Rival:
         mine, other, weight = self._ratios
         return bool(not weight or (mine / weight < _RIGHT and (mine < other or not better)))
 
-    def _is_contradicted(self) -> bool:
-        """Return whether the beams that meet walls contradict the rival."""
-        mine, _, weight = self._ratios
-        return bool(weight and mine / weight > _AGAINST)
-
     def _is_late(self, gain: float) -> bool:
         """Return whether a rival has fallen behind or had enough scans; equal concentrated clouds may both stay."""
-        if self._scans >= (SCANS if self._settled else SETTLES) and self._is_contradicted():
+        mine, _, weight = self._ratios
+        if self._scans >= (SCANS if self._settled else SETTLES) and weight and mine / weight > _AGAINST:
             return True
         over = self._scans >= LONGEST
         if self._prior == 0.0 and self._settled:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpusense.backends import arrays
 from gpusense.localization import starts
 from gpusense.localization.belief import ratio_of_places, ratio_of_scan
 from gpusense.localization.sensors import Sensor, SensorReadings
@@ -26,7 +25,7 @@ from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.pose_algebra import wrap_angle
-from gpusense.world.scanner import classify_ranges, float64_readings
+from gpusense.world.scanner import classify_ranges
 
 # Candidates of each search on a map; effective number of initial candidates of a rival; beams of a scan in a search.
 _CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
@@ -108,9 +107,7 @@ class RivalSearch:
         for index, reading in readings:
             sensor = self._sensors[index]
             if sensor.calibrates:
-                on_host = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
-                scanner = sensor.model.scanner
-                return self.likely(sensor, float64_readings(on_host, scanner))
+                return self.likely(sensor, sensor.values_of(reading))
         return np.empty((0, 3))
 
     def likely(self, sensor: Sensor, ranges: np.ndarray, *, quick: bool = False) -> np.ndarray:
@@ -133,9 +130,13 @@ class RivalSearch:
         return self._field
 
     def _at_random(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key) -> np.ndarray:
-        """Return random poses anywhere, and around the estimate with any heading."""
+        """Return random poses in free cells or among the landmarks, and around the estimate with any heading."""
         if self._pool is None:
-            self._pool = _anywhere(self._sensors)
+            models, bounds = [sensor.model for sensor in self._sensors], None
+            if not any(hasattr(model, "grid") for model in models):
+                xy = np.vstack([model.corners for model in models if isinstance(model, FeatureModel)])
+                bounds = np.array([xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN])
+            self._pool = starts.free_pool(models, bounds)
         anywhere = starts.spread(*self._pool, _TRIES // 2, key)
         wide = max(2 * deviations(covariance)[0], _NEARBY)
         around = starts.normal(pose, np.diag([wide**2, wide**2, math.pi**2]), _TRIES // 2, key)
@@ -172,12 +173,3 @@ def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
 def can_search(sensors: Sequence[Sensor]) -> bool:
     """Return whether a sensor has a map for the search."""
     return any(hasattr(one.model, "grid") or isinstance(one.model, FeatureModel) for one in sensors)
-
-
-def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
-    """Return centres and half widths of all possible places: free cells, or the landmarks' bounding box."""
-    models = [sensor.model for sensor in sensors]
-    if any(hasattr(model, "grid") for model in models):
-        return starts.free_pool(models, None)
-    xy = np.vstack([model.corners for model in models if isinstance(model, FeatureModel)])
-    return starts.free_pool([], np.array([xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN]))

@@ -48,7 +48,6 @@ _MOST, _ALMOST_ALL, _FEW = 0.6, 0.75, 0.4
 _CROWD, _DRIFT = 0.2, 0.1
 # Largest distance between a place and the judged pose that agree [m, rad], and between common displacements.
 _SAME, _SAME_TURN = 0.5, 0.2
-_STILL = np.zeros((3, 3))
 
 
 class Place(NamedTuple):
@@ -98,7 +97,7 @@ def diagnose_run(models: Any, moments: Sequence[Moment], *, search: bool = True)
     places = _Places(sensor, chosen)
     evidence = places.evidence(motion) if search else RunEvidence(motion)
     last = moments[-1]
-    beams = evidence_of(sightings(sensors, {last.sensor: (last.ranges,)}, np.asarray(last.pose, np.float64), _STILL))
+    beams = evidence_of(sightings(sensors, {last.sensor: (last.ranges,)}, np.asarray(last.pose, np.float64)))
     return likely_cause(beams, evidence, search=search)
 
 
@@ -152,7 +151,8 @@ class _Places:
         """Return the evidence of a run with the motion between its scans."""
         windows = self._chosen(motion.windows)
         count = len(windows)
-        judged = [self._at_poses(window) for window in windows]
+        judged = [self._judged([*map(self._ranges, one.moments)], np.array([*map(self._pose, one.moments)]))
+                  for one in windows]  # fmt: skip
         fitting = [one for one in judged if one.fits]
         known = RunEvidence(
             motion, count, len(fitting) / count, judged[-1].fits,
@@ -245,7 +245,7 @@ class _Places:
         """Return the common motion from the judged poses to the places that fit; None without one."""
         if fits.sum() < 3 or not fits[0]:
             return None
-        before = np.array([self._pose(window) for window in windows])[fits]
+        before = np.array([self._pose(window.moments[0]) for window in windows])[fits]
         after = np.array([one.pose for one in places])[fits]
         moves = compose_poses(after, invert_poses(before))
         middle = moves[np.argsort(moves[:, 2])[len(moves) // 2]]
@@ -258,11 +258,11 @@ class _Places:
 
     def _is_near(self, window: Window, place: Place) -> bool:
         """Tell whether a place is the judged pose of its window."""
-        way, turn = motion_between(place.pose, self._pose(window))
+        way, turn = motion_between(place.pose, self._pose(window.moments[0]))
         return way < FAR and turn < FAR_TURN
 
-    def _pose(self, window: Window) -> Floats:
-        return np.asarray(self._moments[window.moments[0]].pose, np.float64)
+    def _pose(self, moment: int) -> Floats:
+        return np.asarray(self._moments[moment].pose, np.float64)
 
     def place(self, window: Window, *, mirrored: bool = False, scale: float = 1.0, quick: bool = False) -> Place:
         """Return the likeliest place of a window on the map, by a few of its scans for ``quick``."""
@@ -308,18 +308,13 @@ class _Places:
         ]
         return float(np.nan_to_num(ratios).sum())
 
-    def _at_poses(self, window: Window) -> Place:
-        """Judge the scans of a window at their poses."""
-        poses = np.array([np.asarray(self._moments[k].pose, np.float64) for k in window.moments])
-        return self._judged([self._ranges(k) for k in window.moments], poses)
-
     def _ranges(self, moment: int) -> Floats:
         return float64_readings(np.asarray(self._moments[moment].ranges), self._sensor.model.scanner)
 
     def _judged(self, scans: list[Floats], poses: Floats) -> Place:
         """Return the place of scans with all their beams judged at (L, 3) poses."""
         pairs = zip(poses, scans, strict=True)
-        seen = [one for pose, scan in pairs for one in sightings([self._sensor], {0: (scan,)}, pose, _STILL)]
+        seen = [one for pose, scan in pairs for one in sightings([self._sensor], {0: (scan,)}, pose)]
         counts, is_right = counts_of(seen), explains(seen, _AGREE, _AGREE_OF_ALL)
         every = max(counts.informative_count, 1)
         return Place(poses[0], counts.agree / every, is_right, counts.short / every)

@@ -7,7 +7,7 @@ modelled mobile robots* (2000).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -126,34 +126,26 @@ def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
     look_at_start(pose, bool(0 <= place[0] <= cols and 0 <= place[1] <= rows), grid.bounds())
 
 
-def _replaced(particles: int) -> int:
-    """Return the number of particles with new poses."""
-    return max(particles // 2, 1)
-
-
-def tries_of(particles: int) -> int:
-    """Return the number of tried poses in a reset."""
-    return max(_LEAST_TRIES, _TRIES * _replaced(particles))
-
-
 def likeliest(
-    tries: np.ndarray,
+    random_poses: Callable[[int], np.ndarray],
     particles: int,
     sensors: Sequence[Sensor],
     readings: Mapping[int, tuple[Any, ...]],
     temperature: float | str,
 ) -> np.ndarray:
-    """Return the likeliest of (M, 3) ``tries``, the centres of a reset's draws."""
+    """Return the likeliest of many random poses, the centres of a reset's draws."""
+    count = max(particles // 2, 1)
+    tries = random_poses(max(_LEAST_TRIES, _TRIES * count))
     score = np.zeros(len(tries))
     for index, reading in readings.items():
         sensor = sensors[index]
         score += sensor.temperature(temperature) * sensor.model.log_likelihood(tries, *reading)
     with np.errstate(invalid="ignore"):
-        return np.asarray(tries[np.argsort(-score, kind="stable")[: max(_replaced(particles) // _SHARE, 1)]])
+        return np.asarray(tries[np.argsort(-score, kind="stable")[: max(count // _SHARE, 1)]])
 
 
 def with_poses(particles: np.ndarray, poses: np.ndarray, key: Key) -> np.ndarray:
     """Replace half of the particles (N, 3) by draws around ``poses``, and return all particles."""
-    count, result = _replaced(len(particles)), particles.copy()
+    count, result = max(len(particles) // 2, 1), particles.copy()
     result[:: max(len(particles) // count, 1)][:count] = spread(poses, _SPREAD, count, key, each=True)
     return result

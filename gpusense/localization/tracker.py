@@ -190,7 +190,10 @@ class Tracker:
     def learn(self, readings: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
         """Determine whether the particles are concentrated, and begin lessons of scans at an uncontradicted pose."""
         self.corrections += 1
-        due = _due_of(self.sensors, readings) if self.options.temperature == "auto" else []
+        due = []
+        if self.options.temperature == "auto":
+            scans = [(self.sensors[index], reading) for index, reading in readings]
+            due = [one for one in scans if one[0].learner is not None and one[0].learner.count()]
         if not (due or not self.together or self.corrections % _LOOK == 0):
             return
         pose, covariance = self.mean_and_covariance()
@@ -210,16 +213,6 @@ class Tracker:
             one_peak = one_peak and not sensor.ambiguous
         step, count = self.progress.step, self.cloud.count
         return settings_of_step(self.options, motion, step, count, self.pool, sensors, one_peak)
-
-
-def _due_of(sensors: Sequence[Sensor], readings: Sequence[SensorReadings]) -> list[tuple[Sensor, tuple[Any, ...]]]:
-    """Count the scans of a correction; return the scans to learn from, with their sensors."""
-    due = []
-    for index, reading in readings:
-        sensor = sensors[index]
-        if sensor.learner is not None and sensor.learner.count():
-            due.append((sensor, reading))
-    return due
 
 
 def is_together(covariance: np.ndarray) -> bool:

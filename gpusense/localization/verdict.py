@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.localization.beam_consistency import BeamConsistency
+from gpusense.localization.beam_consistency import KNOWN, BeamConsistency
 from gpusense.localization.belief import Belief, evidence_of_scan, motion_between, ratio_of_features
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.sensors import Sensor, SensorReadings
@@ -229,15 +229,12 @@ class Evidence:
 
 
 def sightings(
-    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: np.ndarray, covariance: np.ndarray
-) -> list[BeamConsistency]:
+    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: np.ndarray,
+    covariance: np.ndarray = KNOWN,
+) -> list[BeamConsistency]:  # fmt: skip
     """Return the judged beams of all scans among readings."""
-    result = []
-    for index, reading in readings.items():
-        sensor = sensors[index]
-        if sensor.calibrates:
-            result.append(sensor.judge().consistency(sensor.model.scanner, pose, reading[0], covariance))
-    return result
+    chosen = [(sensors[index], reading[0]) for index, reading in readings.items() if sensors[index].calibrates]
+    return [one.judge().consistency(one.model.scanner, pose, ranges, covariance) for one, ranges in chosen]
 
 
 def _count(reading: tuple[Any, ...]) -> int:

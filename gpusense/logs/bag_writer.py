@@ -31,8 +31,11 @@ def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
     with naming(path), tempfile.TemporaryDirectory(prefix=".gpusense-", suffix=".new", dir=path.parent) as folder:
         fresh = Path(folder, path.name)
         try:
-            with _Writer(fresh, first=first) as writer:
-                _write(writer, scans)
+            from rosbags.rosbag1 import Writer as Writer1
+            from rosbags.rosbag2 import Writer as Writer2
+
+            with Writer1(fresh) if first else Writer2(fresh, version=9) as bag:
+                _write(_Writer(bag, first=first), scans)
         except sqlite3.Error as error:  # a full disk, for example
             raise OSError(errno.EIO, str(error), str(path)) from error
         os.replace(fresh, path) if first else shutil.move(fresh, path)
@@ -64,21 +67,10 @@ def _write(writer: _Writer, scans: Iterable[Scan]) -> None:
 class _Writer:
     """Bag writer, message by message."""
 
-    def __init__(self, path: Path, *, first: bool) -> None:
-        from rosbags.rosbag1 import Writer as Writer1
-        from rosbags.rosbag2 import Writer as Writer2
-
-        self._store = type_store(first)
+    def __init__(self, bag: Any, *, first: bool) -> None:
+        self._bag, self._store = bag, type_store(first)
         self._encode = self._store.serialize_ros1 if first else self._store.serialize_cdr
-        self._writer: Any = Writer1(path) if first else Writer2(path, version=9)
         self._connections: dict[str, Any] = {}
-
-    def __enter__(self) -> _Writer:
-        self._writer.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._writer.close()
 
     def scan(self, scan: Scan) -> None:
         """Write a LaserScan."""
@@ -104,9 +96,9 @@ class _Writer:
 
     def _put(self, topic: str, name: str, time: float, **fields: Any) -> None:
         if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, name, typestore=self._store)
+            self._connections[topic] = self._bag.add_connection(topic, name, typestore=self._store)
         message = self._encode(_message(self._store, name, fields), name)
-        self._writer.write(self._connections[topic], round(time * 1e9), message)
+        self._bag.write(self._connections[topic], round(time * 1e9), message)
 
 
 def _header(time: float, frame: str) -> dict[str, Any]:

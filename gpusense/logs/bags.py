@@ -202,7 +202,8 @@ def storages(path: Path) -> list[Storage]:
     for file in files:
         try:
             with errors_at(str(file)):
-                found.append(_storage(file))
+                stats = [one.stat() for one in (file, *_journals(file))]
+                found.append(_read(file, tuple((each.st_size, each.st_mtime_ns) for each in stats)))
         except ValueError as error:
             found.append(Storage(file))
             found[-1].broken[0] = error
@@ -225,11 +226,6 @@ def _parts(folder: Path) -> list[Path]:
     """Return the files of messages in a folder by name; a compressed file only if the plain one is absent."""
     files = [file for file in sorted(folder.iterdir()) if file.is_file() and begins(file, MCAP, SQLITE, ZSTD)]
     return [file for file in files if not begins(file, ZSTD) or file.with_suffix("") not in files]
-
-
-def _storage(file: Path) -> Storage:
-    stats = [one.stat() for one in (file, *_journals(file))]
-    return _read(file, tuple((each.st_size, each.st_mtime_ns) for each in stats))
 
 
 @functools.lru_cache(maxsize=16)

@@ -30,7 +30,7 @@ import contextlib
 import functools
 import gzip
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -52,45 +52,42 @@ def read(
     path: Path, *, range_max: float | None, range_min: float | None, odometry: bool, rear: bool
 ) -> Iterator[Scan | Odometry]:
     """Read the records of a CARMEN log; see :func:`gpusense.read_log` for arguments and errors."""
-    names, limits = _REAR if rear else _FRONT, (range_max, range_min or 0.0)
+    names = _REAR if rear else _FRONT
     scanners: dict[tuple[float, ...], Scanner] = {}
     largest = functools.cache(lambda name: range_max or _range_max_of(path, name))
-    return until_cut(path, lambda lines: _records(path, lines, names, limits, odometry, scanners, largest), skip=True)
 
+    def records(lines: Iterator[tuple[int, bytes]]) -> Iterator[Scan | Odometry]:
+        for where, fields in _messages(path, lines):
+            if fields[0] == b"ODOM":
+                values = _message_numbers(where, fields, 6)
+                if odometry:
+                    yield Odometry(_time(where, fields), _pose(where, values[:3]))
+                continue
+            if fields[0] not in names:
+                continue
+            config, ranges, poses = _laser(where, fields)
+            if fields[0].startswith(b"ROBOT"):
+                start, view, step, stated_max = config[1:5].tolist()
+                # Both view and step are rounded to 1e-6.
+                finer = view / (ranges.size - 1) if ranges.size > 1 else step
+                step, farthest = finer if abs(finer - step) <= 1e-6 else step, range_max or stated_max
+            else:
+                start, step, farthest = -math.pi / 2, _old_step(ranges.size), largest(fields[0])
+            geometry = start, step, ranges.size, farthest
+            if geometry not in scanners:
+                try:
+                    scanners[geometry] = Scanner.uniform(
+                        angle_min=start, angle_increment=step, count=ranges.size, range_max=farthest,
+                        range_min=range_min or 0.0,
+                    )  # fmt: skip
+                except ValueError as error:
+                    raise ValueError(f"{where}: {error}") from None
+            ranges.setflags(write=False)
+            yield Scan(
+                _time(where, fields), ranges, scanners[geometry], _pose(where, poses[3:]), _pose(where, poses[:3])
+            )
 
-def _records(
-    path: Path, lines: Iterator[tuple[int, bytes]], names: tuple[bytes, bytes], limits: tuple[float | None, float],
-    odometry: bool, scanners: dict[tuple[float, ...], Scanner], largest: Callable[[bytes], float],
-) -> Iterator[Scan | Odometry]:  # fmt: skip
-    for where, fields in _messages(path, lines):
-        if fields[0] == b"ODOM":
-            values = _message_numbers(where, fields, 6)
-            if odometry:
-                yield Odometry(_time(where, fields), _pose(where, values[:3]))
-            continue
-        if fields[0] not in names:
-            continue
-        geometry: tuple[float, ...]
-        config, ranges, poses = _laser(where, fields)
-        if fields[0].startswith(b"ROBOT"):
-            start, view, step, stated_max = config[1:5].tolist()
-            # Both view and step are rounded to 1e-6.
-            finer = view / (ranges.size - 1) if ranges.size > 1 else step
-            geometry = start, finer if abs(finer - step) <= 1e-6 else step, ranges.size, limits[0] or stated_max
-        else:
-            geometry = -math.pi / 2, _old_step(ranges.size), ranges.size, largest(fields[0])
-        scanner = scanners.get(geometry)
-        if scanner is None:
-            start, step, count, farthest = geometry
-            try:
-                scanner = Scanner.uniform(
-                    angle_min=start, angle_increment=step, count=int(count), range_max=farthest, range_min=limits[1]
-                )
-            except ValueError as error:
-                raise ValueError(f"{where}: {error}") from None
-            scanners[geometry] = scanner
-        ranges.setflags(write=False)
-        yield Scan(_time(where, fields), ranges, scanner, _pose(where, poses[3:]), _pose(where, poses[:3]))
+    return until_cut(path, records, skip=True)
 
 
 def _messages(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[str, list[bytes]]]:

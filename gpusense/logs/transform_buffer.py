@@ -150,7 +150,6 @@ class TransformBuffer:
 
     def look_up(self, target: str, source: str, time: float | None = None) -> NDArray[np.float64]:
         """Return the (4, 4) pose of ``source`` in ``target``; None as time [s] is the latest known to all links."""
-        target, source = target.strip("/"), source.lstrip("/")
         chain = self._chain(target, source, self._links.values())
         if time is None:
             time = min((link.times[-1] for link, _ in chain if not link.static and link.times), default=0.0)
@@ -166,7 +165,6 @@ class TransformBuffer:
 
     def fixed(self, target: str, source: str) -> NDArray[np.float64]:
         """Return the (4, 4) pose of ``source`` in ``target``, which must be constant."""
-        target, source = target.strip("/"), source.lstrip("/")
         still = [link for link in self._links.values() if not link.moved]
         try:
             return _product((link.at(link.times[-1]), ahead) for link, ahead in self._chain(target, source, still))
@@ -177,7 +175,6 @@ class TransformBuffer:
 
     def history(self, target: str, source: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the (N,) times [s] and (N, 4, 4) poses of the motion of ``source`` in ``target``."""
-        target, source = target.strip("/"), source.lstrip("/")
         chain = self._chain(target, source, self._links.values())
         moving = [link for link, _ in chain if not link.static]
         stamps = sorted({time for link in moving for time in link.times})
@@ -187,6 +184,7 @@ class TransformBuffer:
 
     def _chain(self, target: str, source: str, links: Iterable[Link]) -> list[tuple[Link, bool]]:
         """Return the shortest chain of links from target to source, each with whether it leads to its child."""
+        target, source = target.strip("/"), source.lstrip("/")
         ways: dict[str, list[tuple[str, Link, bool]]] = {}
         for link in links:
             ways.setdefault(link.parent, []).append((link.child, link, True))

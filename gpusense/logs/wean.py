@@ -34,36 +34,33 @@ _MOVED = 0.02
 
 def read(path: Path, *, range_max: float | None, range_min: float | None, odometry: bool) -> Iterator[Scan | Odometry]:
     """Read the records of a log; see :func:`gpusense.read_log` for arguments and errors."""
-    limits = range_max or _RANGE_MAX, range_min or 0.0
     scanners: list[Scanner] = []
-    return until_cut(path, lambda lines: _records(path, lines, limits, odometry, scanners), skip=True)
 
+    def records(lines: Iterator[tuple[int, bytes]]) -> Iterator[Scan | Odometry]:
+        for number, line in lines:
+            fields = line.split()
+            if not fields:
+                continue
+            where = f"{path}:{number}"
+            values = _numbers(where, fields)
+            pose = float(values[0]) / 100, float(values[1]) / 100, float(values[2])
+            if fields[0] == b"O":
+                if odometry:
+                    yield Odometry(float(values[-1]), pose)
+                continue
+            mount = _mount(pose, (float(values[3]) / 100, float(values[4]) / 100, float(values[5])))
+            if not scanners:
+                bearings = -math.pi / 2 + math.pi / _BEAMS * np.arange(_BEAMS)
+                scanners.append(Scanner(bearings, range_max or _RANGE_MAX, range_min or 0.0, mount))
+            first = scanners[0].mount
+            apart = max(math.dist(mount[:2], first[:2]), abs(math.remainder(mount[2] - first[2], math.tau)))
+            if apart > _MOVED:
+                raise ValueError(f"{where}: L: the laser must stay at {first} on the robot, got {mount}")
+            ranges = values[6 : 6 + _BEAMS] / 100
+            ranges.setflags(write=False)
+            yield Scan(float(values[-1]), ranges, scanners[0], pose, None)
 
-def _records(
-    path: Path, lines: Iterator[tuple[int, bytes]], limits: tuple[float, float], odometry: bool, scanners: list[Scanner]
-) -> Iterator[Scan | Odometry]:
-    for number, line in lines:
-        fields = line.split()
-        if not fields:
-            continue
-        where = f"{path}:{number}"
-        values = _numbers(where, fields)
-        pose = float(values[0]) / 100, float(values[1]) / 100, float(values[2])
-        if fields[0] == b"O":
-            if odometry:
-                yield Odometry(float(values[-1]), pose)
-            continue
-        mount = _mount(pose, (float(values[3]) / 100, float(values[4]) / 100, float(values[5])))
-        if not scanners:
-            bearings = -math.pi / 2 + math.pi / _BEAMS * np.arange(_BEAMS)
-            scanners.append(Scanner(bearings, *limits, mount))
-        scanner = scanners[0]
-        apart = max(math.dist(mount[:2], scanner.mount[:2]), abs(math.remainder(mount[2] - scanner.mount[2], math.tau)))
-        if apart > _MOVED:
-            raise ValueError(f"{where}: L: the laser must stay at {scanner.mount} on the robot, got {mount}")
-        ranges = values[6 : 6 + _BEAMS] / 100
-        ranges.setflags(write=False)
-        yield Scan(float(values[-1]), ranges, scanner, pose, None)
+    return until_cut(path, records, skip=True)
 
 
 def _numbers(where: str, fields: list[bytes]) -> Floats:

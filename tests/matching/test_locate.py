@@ -40,6 +40,14 @@ def scan_at(grid: gs.OccupancyGrid, pose, noise: float = 0.0) -> np.ndarray:
     return ranges
 
 
+def poses_of_grid(grid: gs.OccupancyGrid, stride: int, turns: int) -> np.ndarray:
+    """Return the poses of a search: all headings at every few cells."""
+    rows, cols = np.mgrid[0 : grid.shape[0] : stride, 0 : grid.shape[1] : stride]
+    centers = grid.cell_centers(rows.ravel(), cols.ravel())
+    headings = 2 * math.pi / turns * np.arange(turns) + grid.origin[2]
+    return np.column_stack([np.repeat(centers, turns, axis=0), np.tile(headings, len(centers))])
+
+
 @pytest.mark.parametrize("positions", ["free", "all"])
 @pytest.mark.parametrize(("outside", "beams"), [("free", None), ("occupied", 30)])
 def test_the_pose_is_that_of_brute_force(backend, positions, outside, beams):
@@ -49,11 +57,8 @@ def test_the_pose_is_that_of_brute_force(backend, positions, outside, beams):
         grid, SCANNER, PARAMETERS, backend=backend, outside=outside, beams=beams, unknown="free"
     )
     found = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1, positions=positions, refine=False)
-    headings = 2 * math.pi / 64 * np.arange(64)
-    rows, cols = np.mgrid[0:48:2, 0:68:2]
-    centers = grid.cell_centers(rows.ravel(), cols.ravel())
-    poses = np.array([(x, y, heading + 0.4) for x, y in centers for heading in headings])
-    log_p = model.log_likelihood(poses, ranges).reshape(*rows.shape, 64)
+    poses = poses_of_grid(grid, 2, 64)
+    log_p = model.log_likelihood(poses, ranges).reshape(24, 34, 64)
     if positions == "free":
         log_p[~grid.free[::2, ::2]] = -np.inf
     best = poses[log_p.argmax()]
@@ -94,10 +99,7 @@ def test_the_pose_of_a_bilinear_field_is_that_of_brute_force(seeds):
         found = gs.locate_scan(
             model, ranges, resolution=stride * grid.resolution, angle=0.2, positions="all", refine=False
         )
-        rows, cols = np.mgrid[0 : grid.shape[0] : stride, 0 : grid.shape[1] : stride]
-        centers = grid.cell_centers(rows.ravel(), cols.ravel())
-        headings = 2 * math.pi / 32 * np.arange(32) + grid.origin[2]
-        poses = np.column_stack([np.repeat(centers, 32, axis=0), np.tile(headings, len(centers))])
+        poses = poses_of_grid(grid, stride, 32)
         log_p = model.log_likelihood(poses, ranges)
         assert found.poses == len(poses)
         assert found.log_likelihood == pytest.approx(float(log_p.max()), rel=1e-5, abs=1e-4), seed
@@ -208,9 +210,10 @@ def test_scans_off_the_map_and_without_readings_have_no_match():
     assert nothing.status == "no match" and np.isnan(nothing.pose).all() and nothing.modes == ()
 
 
-def test_a_changed_map_is_searched_anew():
+@pytest.mark.parametrize("parameters", [(), (PARAMETERS,)], ids=["default", "given"])
+def test_a_changed_map_is_searched_anew(parameters):
     grid = house()
-    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="numpy")
+    model = gs.LikelihoodFieldModel(grid, SCANNER, *parameters, backend="numpy")
     ranges = scan_at(grid, (2.05, 2.55, 1.0))
     before = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
     model.update_map(np.full((40, 1), 100), (4, 25))
@@ -242,9 +245,6 @@ def test_a_default_model_is_searched_with_the_wide_field():
     model, found = located()
     assert found.log_likelihood == located(wide)[1].log_likelihood != located(tracking)[1].log_likelihood
     assert gs.locate_scan(copy.copy(model), ranges, resolution=0.2, angle=0.1).log_likelihood == found.log_likelihood
-    model.update_map(np.full((40, 1), 100), (4, 25))
-    after = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
-    assert (found.status, after.status) == ("found", "no match")
 
 
 def test_maps_too_large_for_the_device_are_refused_before_their_tables_are_made(monkeypatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -52,14 +51,6 @@ def drawn(origin=(0.0, 0.0, 0.0)):
     return gs.OccupancyGrid(cells, resolution=0.05, origin=origin)
 
 
-def poses_in(grid, local):
-    """Return poses of the world from poses in the grid's frame."""
-    x0, y0, yaw = grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    x, y, theta = local.T
-    return np.column_stack([x0 + c * x - s * y, y0 + s * x + c * y, theta + yaw])
-
-
 @pytest.fixture(scope="module")
 def local():
     rng = np.random.default_rng(7)
@@ -78,7 +69,7 @@ def errors(match, truth):
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e6, -4e6, 0.6)], ids=["near", "far and yawed"])
 def test_poor_guesses_in_a_map_are_corrected_to_a_fraction_of_a_cell(device, local, origin):
     grid = drawn(origin)
-    truth = poses_in(grid, local)
+    truth = gs.compose_poses(grid.origin, local)
     rng = np.random.default_rng(1)
     guess = truth + np.column_stack([rng.uniform(-0.5, 0.5, (12, 2)), np.radians(rng.uniform(-10, 10, 12))])
     match = gs.match_scan(grid, scans_at(grid, truth), RING, guess, backend=device)
@@ -92,7 +83,7 @@ def test_poor_guesses_in_a_map_are_corrected_to_a_fraction_of_a_cell(device, loc
 @pytest.mark.parametrize(("method", "cells"), [("gauss_newton", 1.0), ("correlative", 2.5)])
 def test_fields_find_poses_to_the_cell(device, local, method, cells):
     grid = drawn((1.0, 2.0, 0.3))
-    truth = poses_in(grid, local)
+    truth = gs.compose_poses(grid.origin, local)
     match = gs.match_scan(
         grid, scans_at(grid, truth), RING, truth + np.array([0.15, -0.1, 0.05]), method, backend=device
     )

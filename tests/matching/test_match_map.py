@@ -23,8 +23,7 @@ def cut(grid: gs.OccupancyGrid, pose, shape=(40, 50), resolution=0.1) -> gs.Occu
     local = gs.OccupancyGrid(np.zeros(shape, int), resolution, (-1.5, -2.0, 0.0))
     rows, cols = (index.ravel() for index in np.indices(shape))
     xy = local.cell_centers(rows, cols)
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    world = np.stack([pose[0] + cos * xy[:, 0] - sin * xy[:, 1], pose[1] + sin * xy[:, 0] + cos * xy[:, 1]], axis=1)
+    world = gs.compose_poses(pose, np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
     col, row = np.floor(grid.world_to_cells(world)).astype(int).T
     inside = (row >= 0) & (row < grid.shape[0]) & (col >= 0) & (col < grid.shape[1])
     cells = np.full(len(row), -1)

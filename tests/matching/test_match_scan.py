@@ -36,12 +36,7 @@ def test_the_mount_moves_the_frame(pairs):
     mount = (0.3, -0.2, 0.7)
     scanner = gs.Scanner(RING.bearings, range_max=30.0, mount=mount)
     robot = np.array([0.2, -0.1, 0.3])
-
-    def sensor(pose):
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        return (pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1], pose[2] + mount[2])
-
-    scans = [segments_scan(ROOM, sensor(pose), scanner) for pose in (np.zeros(3), robot)]
+    scans = [segments_scan(ROOM, gs.compose_poses(pose, mount), scanner) for pose in (np.zeros(3), robot)]
     match = gs.match_scan(*scans, scanner, (0.1, 0.0, 0.2), backend="numpy")
     np.testing.assert_allclose(match.pose, robot, atol=3e-3)
     assert np.linalg.eigvalsh(match.covariance).min() > 0

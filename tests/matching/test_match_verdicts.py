@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from support.matching_scenes import FRONT, RING, WALL, box, random_pairs, relative, segments_scan
+from support.matching_scenes import FRONT, RING, WALL, box, random_pairs, segments_scan
 
 import gpusense as gs
 from gpusense.matching.columns import matrices_of, triangle_of
@@ -31,7 +31,7 @@ def corridor_pairs(scanner: gs.Scanner, noise: float, heading: float, count: int
     second = first + rng.uniform(-1, 1, (count, 3)) * (0.3, 0.1, 0.1)
     scans = [np.array([segments_scan(CORRIDOR, tuple(p), scanner) for p in poses]) for poses in (first, second)]
     one, two = (z + noise * rng.normal(size=z.shape) for z in scans)
-    truth = relative(first, second)
+    truth = gs.pose_difference(first, second)
     return one, two, truth, truth + 0.3 * np.array([math.cos(heading), -math.sin(heading), 0.0])
 
 

@@ -10,9 +10,9 @@ import pytest
 from gpusense._util.angles import wrapped
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
-from gpusense.matching.pose_grid import distinct_poses
+from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.matching.score_tables import ScoreTables, field_scores
-from gpusense.matching.search import PoseGrid, Search
+from gpusense.matching.search import Search
 
 BACKENDS = ("numpy", "opencl", "warp")
 

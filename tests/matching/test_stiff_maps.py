@@ -32,9 +32,7 @@ def drawn(segments, origin=(0.0, 0.0, 0.0)):
 
 def in_world(origin, pose):
     """Return a pose of the scene in the world of a map."""
-    c, s = math.cos(origin[2]), math.sin(origin[2])
-    x, y = pose[0] + 6, pose[1] + 6
-    return np.array([origin[0] + c * x - s * y, origin[1] + s * x + c * y, pose[2] + origin[2]])
+    return gs.compose_poses(origin, pose + np.array([6.0, 6.0, 0.0]))
 
 
 @each_method

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from support.matching_scenes import box, relative, segments_scan
+from support.matching_scenes import box, segments_scan
 
 import gpusense as gs
+from gpusense.world.pose_algebra import rotations
 
 # A ring of corridors with niches around a block: each place is observed in all directions.
 BLOCK = np.array([
@@ -45,7 +46,7 @@ def scans_of(
 
 def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np.ndarray:
     """Return poses of an odometer that overestimates distances and adds turns [rad/m]."""
-    steps = relative(poses[:-1], poses[1:])
+    steps = gs.pose_difference(poses[:-1], poses[1:])
     steps[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
     steps[:, :2] *= stretch
     result = [np.array([3.0, -2.0, 1.0])]
@@ -56,6 +57,18 @@ def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np
 
 def errors(chain: gs.ScanChain, truth: np.ndarray) -> np.ndarray:
     """Return distances between estimated and true poses in the frame of the first scan [m]."""
-    found = relative(np.repeat(chain.poses[:1], len(truth), axis=0), chain.poses)
-    wanted = relative(np.repeat(truth[:1], len(truth), axis=0), truth)
-    return np.hypot(*(found - wanted)[:, :2].T)
+    off = gs.pose_difference(chain.poses[0], chain.poses) - gs.pose_difference(truth[0], truth)
+    return np.hypot(*off[:, :2].T)
+
+
+def normalised_errors(chain: gs.ScanChain, truth: np.ndarray) -> np.ndarray:
+    """Return squared errors of poses (S - 1,) over their covariances, 1 in the mean of right covariances."""
+    off = gs.pose_difference(chain.poses[0], chain.poses) - gs.pose_difference(truth[0], truth)
+    off = off[1:] @ rotations(chain.poses[0, 2]).T
+    return np.einsum("si,sij,sj->s", off, np.linalg.inv(chain.covariance[1:]), off) / 3
+
+
+def wrong_motions(chain: gs.ScanChain, truth: np.ndarray) -> np.ndarray:
+    """Return whether motions from scan to scan (S - 1,) are off by more than 0.3 m or 0.15 rad."""
+    off = gs.pose_difference(chain.poses[:-1], chain.poses[1:]) - gs.pose_difference(truth[:-1], truth[1:])
+    return (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(gs.wrap_angle(off[:, 2])) > 0.15)

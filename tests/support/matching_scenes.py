@@ -42,17 +42,10 @@ def table_legs(seed: int) -> np.ndarray:
     return np.array([wall for x, y in place for wall in box(x - 0.05, y - 0.05, x + 0.05, y + 0.05)])
 
 
-def relative(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return (S, 3) poses of second frames in first ones."""
-    c, s, d = np.cos(first[:, 2]), np.sin(first[:, 2]), second - first
-    turn = np.angle(np.exp(1j * d[:, 2]))
-    return np.stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1], turn], axis=1)
-
-
 def random_pairs(count: int, scanner: gs.Scanner, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return scans of ROOM from pairs of neighbouring poses, and the second poses in the first frames."""
     rng = np.random.default_rng(seed)
     first = np.column_stack([rng.uniform(-1.2, 1.2, (count, 2)), rng.uniform(-3, 3, count)])
     second = first + np.column_stack([rng.uniform(-0.4, 0.4, (count, 2)), rng.uniform(-0.2, 0.2, count)])
     scans = [np.array([segments_scan(ROOM, tuple(pose), scanner) for pose in poses]) for poses in (first, second)]
-    return scans[0], scans[1], relative(first, second)
+    return scans[0], scans[1], gs.pose_difference(first, second)

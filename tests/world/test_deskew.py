@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.matching_scenes import RING, ROOM, relative, segments_scan
+from support.matching_scenes import RING, ROOM, segments_scan
 
 import gpusense as gs
 from gpusense.world.deskew import beam_poses
@@ -63,7 +63,8 @@ def test_velocities_are_constant():
     np.testing.assert_allclose(place[:, -1], motion[:, :2])
     np.testing.assert_allclose(heading, motion[:, 2:] * np.linspace(0, 1, 5))
     # The same small motion leads from each beam to the next.
-    steps = relative(np.column_stack([place[0, :-1], heading[0, :-1]]), np.column_stack([place[0, 1:], heading[0, 1:]]))
+    poses = np.column_stack([place[0], heading[0]])
+    steps = gs.pose_difference(poses[:-1], poses[1:])
     np.testing.assert_allclose(steps, np.repeat(steps[:1], 4, axis=0), atol=1e-12)
 
 
@@ -84,7 +85,7 @@ def test_readings_are_those_of_a_robot_at_rest(drive):
 @pytest.mark.parametrize("method", ["auto", "gauss_newton"])
 def test_matches_between_scans_lose_the_error_of_the_motion(drive, method):
     first, second, motion, one, two = drive
-    truth = relative(first, second)
+    truth = gs.pose_difference(first, second)
     ways = dict(motion=motion * BACK, reference_motion=motion)
     found, skewed = (gs.match_scan(one, two, MOVING, truth, method, "opencl", **way) for way in (ways, {}))
     before, after = (np.hypot(*(match.pose - truth)[:, :2].T) for match in (skewed, found))

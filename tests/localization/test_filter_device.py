@@ -7,28 +7,34 @@ import weakref
 
 import numpy as np
 import pytest
+from support.tracking_scene import FINE, GRID, driven, scan_at
+from support.tracking_scene import TRUTH as POSE
 
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.models import chunking as pieces
 
-GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
-SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
-POSE = np.array([3.0, 2.5, 0.4])
+
+def begun(backend, variances, **options):
+    """Return a filter at ``POSE``."""
+    model = gs.LikelihoodFieldModel(GRID, FINE, backend=backend)
+    pf = gs.ParticleFilter(model, **{"particles": 300, "seed": 5, "temperature": 0.2} | options)
+    pf.initialize(mean=POSE, covariance=np.diag(variances))
+    return pf
+
+
+def recorded(target, monkeypatch):
+    """Return a list of the calls of an object's ``run`` from now on."""
+    calls, run = [], target.run
+    monkeypatch.setattr(target, "run", lambda *a, **k: (calls.append(a), run(*a, **k))[1])
+    return calls
 
 
 def tracked(stages):
-    model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend="warp:cpu")
+    model = gs.LikelihoodFieldModel(GRID, FINE, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend="warp:cpu")
     pf = gs.ParticleFilter(model, particles=300, seed=5, stages=stages, temperature=0.2)
-    pose, odometry = np.array([3.0, 2.5, 0.4]), np.zeros(3)
-    pf.initialize(mean=pose, covariance=np.diag([0.1, 0.1, 0.03]))
-    caster = gs.RayCaster(GRID, range_max=10.0, backend="numpy")
-    for _ in range(5):
-        moved = gs.compose_poses(odometry, (0.2, 0, 0.1))
-        pf.predict(odometry, moved)
-        pose, odometry = gs.compose_poses(pose, (0.2, 0, 0.1)), moved
-        pf.correct(caster.cast(pose[None], SCANNER.bearings)[0])
-    return pf, pose
+    pf.initialize(mean=POSE, covariance=np.diag([0.1, 0.1, 0.03]))
+    return pf, driven(pf, 5, FINE)
 
 
 def test_a_stage_on_a_gpu_is_one_recorded_program(warp_as_gpu):
@@ -57,7 +63,7 @@ def test_a_correction_is_one_graph_with_a_copy_of_its_inputs_and_one_of_its_resu
         )
     pf, pose = tracked(2)
     assert np.array_equal(pf.host_particles(), expected.host_particles())
-    ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(pose[None], SCANNER.bearings)[0].astype(float)
+    ranges = scan_at(pose, FINE)
     for step in range(12):
         copies.clear()
         pf.predict((0, 0, 0), (0.01, 0, 0))
@@ -91,8 +97,8 @@ def test_scans_of_host_and_device_have_the_same_bits(warp_as_gpu, monkeypatch, g
     import warp as wp
 
     monkeypatch.setattr(warp_as_gpu, "info", dataclasses.replace(warp_as_gpu.info, graphs=graphs))
-    models = [gs.LikelihoodFieldModel(GRID, SCANNER, backend="warp:cpu") for _ in range(2)]
-    scans = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([POSE, POSE], SCANNER.bearings).astype(float)
+    models = [gs.LikelihoodFieldModel(GRID, FINE, backend="warp:cpu") for _ in range(2)]
+    scans = [scan_at(POSE, FINE)] * 2
 
     def run(*on_device):
         pf = gs.ParticleFilter(models, particles=200, seed=5)
@@ -107,13 +113,10 @@ def test_scans_of_host_and_device_have_the_same_bits(warp_as_gpu, monkeypatch, g
 
 
 def test_corrections_of_wide_clouds_refine_the_estimate_that_each_step_asks_for(backend, monkeypatch):
-    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
     ranges = np.full(60, np.nan)
     ranges[0] = 1.0
-    pf, fresh = (gs.ParticleFilter(model, particles=300, seed=5, temperature=0.01, recovery=None) for _ in range(2))
-    pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.2, 0.2, 4.0]))
-    launched, estimates = [], pf._cloud._estimates.run
-    monkeypatch.setattr(pf._cloud._estimates, "run", lambda *a: (launched.append(a), estimates(*a)))
+    pf, fresh = (begun(backend, (0.2, 0.2, 4.0), temperature=0.01, recovery=None) for _ in range(2))
+    launched = recorded(pf._cloud._estimates, monkeypatch)
     for k in range(9):
         if k == 6:
             launched.clear()
@@ -127,11 +130,9 @@ def test_corrections_of_wide_clouds_refine_the_estimate_that_each_step_asks_for(
 
 
 def test_a_cloud_that_becomes_wide_needs_no_further_launches(backend, monkeypatch):
-    model, motion = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend), gs.OdometryMotion(least=(0.05, 0.03))
-    pf = gs.ParticleFilter(model, motion=motion, particles=300, seed=5, temperature=0.01, recovery=None)
-    pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.01, 0.01, 1e-3]))
-    launched, deviations, estimates = [], [], pf._cloud._estimates.run
-    monkeypatch.setattr(pf._cloud._estimates, "run", lambda *a: (launched.append(a), estimates(*a)))
+    motion = gs.OdometryMotion(least=(0.05, 0.03))
+    pf = begun(backend, (0.01, 0.01, 1e-3), motion=motion, temperature=0.01, recovery=None)
+    launched, deviations = recorded(pf._cloud._estimates, monkeypatch), []
     for _ in range(12):
         pf.predict((0, 0, 0), (0.0, 0, 0))
         pf.correct(np.full(60, np.nan))
@@ -140,14 +141,11 @@ def test_a_cloud_that_becomes_wide_needs_no_further_launches(backend, monkeypatc
 
 
 def test_corrections_compute_the_estimate(backend, monkeypatch):
-    ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[3.0, 2.5, 0.4]], SCANNER.bearings)[0]
+    ranges = scan_at(POSE, FINE)
 
     def run(asked):
-        model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
-        pf = gs.ParticleFilter(model, particles=300, seed=5, temperature=0.2)
-        pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.01, 0.01, 0.003]))
-        launched, estimates = [], pf._cloud._estimates.run
-        monkeypatch.setattr(pf._cloud._estimates, "run", lambda *a: (launched.append(a), estimates(*a)))
+        pf = begun(backend, (0.01, 0.01, 0.003))
+        launched = recorded(pf._cloud._estimates, monkeypatch)
         for k in range(8):
             pf.predict((0, 0, 0), (0.01, 0, 0))
             pf.correct(ranges)
@@ -168,23 +166,21 @@ def test_corrections_compute_the_estimate(backend, monkeypatch):
 
 def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch):
     grid = gs.OccupancyGrid(GRID.cells, 0.1, (20.0, -7.0, 0.3))
-    scanner = gs.Scanner(SCANNER.bearings, range_max=10.0, mount=(0.2, -0.1, 0.5))
-    caster, start = gs.RayCaster(grid, range_max=10.0, backend="numpy"), gs.compose_poses((20.0, -7.0, 0.3), POSE)
+    scanner = gs.Scanner(FINE.bearings, range_max=10.0, mount=(0.2, -0.1, 0.5))
+    start = gs.compose_poses(grid.origin, POSE)
 
     def run(expects, readings):
         model = gs.LikelihoodFieldModel(grid, scanner, backend=backend)
         pf, pose, turn = gs.ParticleFilter(model, particles=300, seed=5, temperature=0.2), start, (0.2, 0, 0.3)
         if not expects:
             monkeypatch.setattr(pf._parts.verdict, "expected", lambda *_: [])
-        alone, estimates, judge = [], [], pf._sensors[0].judge()
-        launch = judge._space.run
-        monkeypatch.setattr(judge._space, "run", lambda *a, **k: (alone.append(a), launch(*a, **k)))
+        alone, estimates = recorded(pf._sensors[0].judge()._space, monkeypatch), []
         pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.003]))
         for _ in range(10):
             pose = gs.compose_poses(pose, turn)
             pf.predict((0, 0, 0), turn)
-            sensor = gs.compose_poses(pose, scanner.mount)
-            pf.correct(np.where(readings, caster.cast(sensor[None], scanner.bearings)[0], np.nan))
+            ranges = scan_at(gs.compose_poses(pose, scanner.mount), scanner, grid)
+            pf.correct(np.where(readings, ranges, np.nan))
             one = pf.estimate()
             estimates.append((*one.pose, one.p_lost, one.explained))
         return estimates, len(alone)
@@ -198,14 +194,14 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
 
 def test_a_robot_that_crosses_a_long_map_repeats_its_recordings(warp_as_gpu):
     grid = gs.OccupancyGrid(np.pad(np.zeros((20, 400), int), 2, constant_values=100), resolution=0.1)
-    scanner = gs.Scanner(SCANNER.bearings, range_max=2.0)
-    caster, pose = gs.RayCaster(grid, range_max=2.0, backend="numpy"), np.array([1.0, 1.2, 0.0])
+    scanner = gs.Scanner(FINE.bearings, range_max=2.0)
+    pose = np.array([1.0, 1.2, 0.0])
     pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend="warp:cpu"), particles=100, temperature=0.2)
     pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.003]))
     for _ in range(30):
         pose[0] += 0.6
         pf.predict((0, 0, 0), (0.6, 0, 0))
-        pf.correct(caster.cast(pose[None], scanner.bearings)[0])
+        pf.correct(scan_at(pose, scanner, grid))
         assert abs(pf.estimate().pose[1] - 1.2) < 0.2
     # The last part of a key is the map on the device.
     assert len({key[-1] for key, _ in pf._cloud._recordings.items()}) == 1
@@ -214,10 +210,8 @@ def test_a_robot_that_crosses_a_long_map_repeats_its_recordings(warp_as_gpu):
 @pytest.mark.long
 def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
     def run():
-        model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(), backend="opencl")
-        pf = gs.ParticleFilter(model, particles=(100, 2000), seed=5, temperature=0.2)
-        pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.1, 0.1, 0.03]))
-        ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[3.0, 2.5, 0.4]], SCANNER.bearings)[0]
+        pf = begun("opencl", (0.1, 0.1, 0.03), particles=(100, 2000))
+        ranges = scan_at(POSE, FINE)
         counts = []
         for _ in range(6):
             pf.predict((0, 0, 0), (0, 0, 0))
@@ -239,9 +233,7 @@ def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
 
 def test_clouds_are_scored_in_pieces(backend, monkeypatch):
     def run():
-        model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
-        pf = gs.ParticleFilter(model, particles=700, seed=5, temperature=0.2)
-        pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.1, 0.1, 0.03]))
+        pf = begun(backend, (0.1, 0.1, 0.03), particles=700)
         for ranges in (np.full(60, 2.0), np.full(60, np.nan), np.full(60, 3.0)):
             pf.predict((0, 0, 0), (0.1, 0, 0))
             pf.correct(ranges)

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from support.filter_scene import everything
+from support.tracking_scene import GRID, SCANNER, scan_at
+from support.tracking_scene import TRUTH as START
 
 import gpusense as gs
 
-GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
-SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.2, count=30, range_max=10.0)
 BEHIND = gs.Scanner.uniform(angle_min=-1.0, angle_increment=0.2, count=11, range_max=10.0, mount=(-0.2, 0, np.pi))
 LANDMARKS = np.random.default_rng(3).uniform(0, 6, (8, 2))
-START, TURN = np.array([3.0, 2.5, 0.4]), (0.2, 0.0, 0.1)
+TURN = (0.2, 0.0, 0.1)
 
 SENSORS: dict[str, Callable[[str], Any]] = {
     "field": lambda b: gs.LikelihoodFieldModel(GRID, SCANNER, backend=b),
@@ -44,8 +44,7 @@ def reading(name, pose, rng):
     odd = rng.random() < 0.15
     if name in ("field", "beam"):
         scanner = SCANNER if name == "field" else BEHIND
-        at = gs.compose_poses(pose, scanner.mount)
-        ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(at[None], scanner.bearings)[0]
+        ranges = scan_at(gs.compose_poses(pose, scanner.mount), scanner)
         return (
             np.where(rng.random(len(ranges)) < 0.7, 1.0, ranges) if odd else ranges + rng.normal(0, 0.02, len(ranges))
         )
@@ -155,6 +154,19 @@ def test_the_sample_size_is_that_of_the_weights_after_a_motion(name, options, ba
         pf.predict((0, 0, 0), TURN)
         pf.correct(reading(name, pose, rng))
         assert pf.estimate().effective_sample_size == pytest.approx(1 / np.sum(pf.host_weights() ** 2), rel=1e-6)
+
+
+def test_there_is_no_verdict_among_landmarks_before_enough_features():
+    pf, pose, rng = gs.ParticleFilter(SENSORS["landmarks"]("numpy"), particles=300), START, np.random.default_rng(3)
+    pf.initialize(mean=START, covariance=np.diag([0.1, 0.1, 0.02]))
+    for _ in range(5):
+        pose = gs.compose_poses(pose, TURN)
+        pf.predict((0, 0, 0), TURN)
+        pf.correct((reading("landmarks", pose, rng),))
+    pf.correct((np.zeros((0, 2)),))
+    assert not pf.estimate().lost
+    with pytest.raises(ValueError, match="features"):
+        pf.correct((np.zeros(3),))
 
 
 @pytest.mark.parametrize("threshold", [0.5, 1.0])

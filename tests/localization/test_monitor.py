@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -141,21 +142,16 @@ def test_several_sensors_and_landmarks():
     front = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
     points = np.random.default_rng(0).uniform(0, 8, (12, 2))
     landmarks = gs.LandmarkModel(gs.LandmarkMap(points), backend="numpy")
-    for off, word in ((0.0, "tracking"), (2.5, "lost")):
-        monitor = gs.PoseMonitor([front, landmarks])
+    # Both, and landmarks alone with a covariance of 0.
+    for models, off in itertools.product(((front, landmarks), (landmarks,)), (0.0, 2.5)):
+        monitor = gs.PoseMonitor(models)
         for pose in POSES:
             d = points - pose[:2]
             seen = np.column_stack([np.hypot(*d.T), gs.wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])])
-            found = monitor.update(pose + np.array([off, off, 0.0]), {front: scan_at(pose), landmarks: (seen,)})
-        assert found.verdict == word
-    # Only landmarks, with a covariance of 0.
-    for off, word in ((0.0, "tracking"), (2.5, "lost")):
-        monitor = gs.PoseMonitor(landmarks)
-        for pose in POSES:
-            d = points - pose[:2]
-            seen = np.column_stack([np.hypot(*d.T), gs.wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])])
-            found = monitor.update(pose + np.array([off, off, 0.0]), (seen,))
-        assert found.verdict == word and math.isnan(found.explained)
+            readings = {front: scan_at(pose), landmarks: (seen,)}
+            found = monitor.update(pose + np.array([off, off, 0.0]), {model: readings[model] for model in models})
+        assert found.verdict == ("lost" if off else "tracking")
+        assert math.isnan(found.explained) == (front not in models)
 
 
 @pytest.mark.parametrize(

@@ -192,44 +192,46 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
     return found
 
 
+def compared(backend, lanes, count=1500, **options):
+    """Return the buffers of a backend, which have the bits of the reference."""
+    expected, found = run_step("numpy", count, **options), run_step(backend, count, lanes=lanes, **options)
+    for name, values in expected.items():
+        assert np.array_equal(values, found[name], equal_nan=True), name
+    return found
+
+
+in_lanes = pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+
+
 # The largest cloud has more blocks than a work-item sums.
+@in_lanes
 @pytest.mark.parametrize("count", [1, 37, 1500])
 @pytest.mark.parametrize("flags", [PLAIN, frozenset({"FLOAT64"})], ids=["float32", "float64"])
-@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
 @pytest.mark.sampled(1.0)
 def test_every_backend_has_the_bits_of_the_reference(backend, count, flags, lanes):
-    expected, found = run_step("numpy", count, flags), run_step(backend, count, flags, lanes=lanes)
-    for name, values in expected.items():
-        assert np.array_equal(values, found[name]), name
+    compared(backend, lanes, count, flags=flags)
 
 
-@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+@in_lanes
 def test_deep_ladders_have_the_bits_of_the_reference(backend, lanes):
-    expected, found = run_step("numpy", 1500, depth=2.0**-14), run_step(backend, 1500, lanes=lanes, depth=2.0**-14)
-    for name, values in expected.items():
-        assert np.array_equal(values, found[name]), name
-    state = found["state"]
+    state = compared(backend, lanes, depth=2.0**-14)["state"]
     assert state[c.RUNG] == 2.0**-14 and state[c.LEFT] == 1 - 2.0**-14
     # The evidence is computed at the whole temperature.
     assert state[c.EVIDENCE] == 0 and state[c.SLOW] == 0.9
 
 
-@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+@in_lanes
 def test_weights_stay_where_only_particles_without_one_are_possible(backend, lanes):
-    expected, found = run_step("numpy", 1500, lone=True), run_step(backend, 1500, lanes=lanes, lone=True)
-    for name, values in expected.items():
-        assert np.array_equal(values, found[name], equal_nan=True), name
+    found = compared(backend, lanes, lone=True)
     stage = found["state"][: c.STAGE]
     assert stage[c.DEGENERATE] == 1 and stage[c.TOTAL] == 750 * 2.0**36 and stage[c.LEFT] == 0
     assert np.array_equal(found["weight"][:4] > 0, [False, True, False, True])
 
 
+@in_lanes
 @pytest.mark.parametrize("draws", [c.INDEPENDENT, c.RESIDUAL], ids=["stratified", "residual"])
-@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
 def test_other_draws_have_the_bits_of_the_reference(backend, draws, lanes):
-    expected, found = run_step("numpy", 1500, draws=draws), run_step(backend, 1500, lanes=lanes, draws=draws)
-    for name, values in expected.items():
-        assert np.array_equal(values, found[name]), name
+    found = compared(backend, lanes, draws=draws)
     if draws == c.RESIDUAL:
         # Certain copies of the second stage, in order.
         assert 0 < found["copies"][-1] <= 1500 and (np.diff(found["copies"]) >= 0).all()

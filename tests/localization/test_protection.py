@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import mpmath
 import numpy as np
 import pytest
+from support.tracking_scene import scan_at
 
 import gpusense as gs
 
@@ -144,7 +145,7 @@ def test_a_cluster_and_the_best_particle_count_all_particles() -> None:
 def test_estimates_by_scans_are_widened(backend: str) -> None:
     scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.2, count=32, range_max=12.0)
     model = gs.LikelihoodFieldModel(ROOM, scanner, backend=backend)
-    ranges = gs.RayCaster(ROOM, range_max=12.0, backend="numpy").cast(np.array([[3.0, 2.0, 0.3]]), scanner.bearings)[0]
+    ranges = scan_at((3.0, 2.0, 0.3), scanner, ROOM)
     pf = gs.ParticleFilter(model, particles=300)
     pf.initialize(mean=(3.0, 2.0, 0.3), covariance=np.diag([0.01, 0.01, 0.001]))
     assert pf.estimate().widening == 1
@@ -162,7 +163,7 @@ def test_the_scan_bounds_a_pose_without_a_covariance(backend: str) -> None:
     scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.1, count=62, range_max=12.0)
     model = gs.LikelihoodFieldModel(ROOM, scanner, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
     pose = np.array([3.0, 2.0, 0.3])
-    ranges = gs.RayCaster(ROOM, range_max=12.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+    ranges = scan_at(pose, scanner, ROOM)
 
     def radius(place, readings, risk=0.3):
         found = gs.PoseMonitor(model).update(place, readings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.tracking_scene import scan_at
 
 import gpusense as gs
 
@@ -27,7 +28,7 @@ def test_a_tuple_of_numbers_is_a_reading():
     array.correct(np.array([1.2, 2.1]))
     np.testing.assert_array_equal(pair.host_weights(), array.host_weights())
     field = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
-    ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[1.0, 2.0, 0.1]], SCANNER.bearings)[0]
+    ranges = scan_at((1.0, 2.0, 0.1), SCANNER, GRID)
     pair, array = filter_of(field), filter_of(field)
     pair.correct(tuple(ranges.tolist()))
     array.correct(ranges)
@@ -71,7 +72,7 @@ def test_a_filter_begins_from_the_likelihood_of_a_scan(backend):
     grid, parameters = gs.OccupancyGrid(cells, resolution=0.1), gs.LikelihoodFieldParameters(sigma_hit=0.1)
     model = gs.LikelihoodFieldModel(grid, SCANNER, parameters, backend=backend)
     truth = np.array([4.43, 1.27, 2.6])
-    ranges = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(truth[None], SCANNER.bearings)[0]
+    ranges = scan_at(truth, SCANNER, grid)
     likelihood = gs.pose_likelihood(model, ranges, resolution=0.1, headings=90, positions="free")
     pf = gs.ParticleFilter(model, particles=2000, seed=1)
     pf.initialize_from(likelihood)
@@ -103,5 +104,6 @@ def test_what_a_likelihood_must_have():
     pf = gs.ParticleFilter(fixes(), particles=50)
     with pytest.raises(TypeError, match="likelihood: must be one of pose_likelihood"):
         pf.initialize_from(object())
-    with pytest.raises(RuntimeError, match="initialize_uniform or initialize_from"):
-        pf.estimate()
+    for call in (pf.estimate, lambda: pf.correct(np.zeros(2))):
+        with pytest.raises(RuntimeError, match="initialised first, by initialize, initialize_uniform or"):
+            call()

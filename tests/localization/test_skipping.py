@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.tracking_scene import FINE, GRID, scan_at
+from support.tracking_scene import TRUTH as POSE
 
 import gpusense as gs
 from gpusense.localization.filter_core import without_skipped
 from gpusense.localization.sensors import Sensor
 
-GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
-SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
-POSE = np.array([3.0, 2.5, 0.4])
-WALLS = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
+WALLS = scan_at(POSE, FINE)
 BLOCKED = np.arange(20, 32)
 RNG = np.random.default_rng(0)
 NEAR = POSE + RNG.normal(0, (0.03, 0.03, 0.01), (50, 3))
@@ -21,7 +20,7 @@ ANYWHERE = np.column_stack([RNG.uniform((0.5, 0.5), (8, 6), (64, 2)), RNG.unifor
 
 def sensor(beams=None):
     parameters = gs.LikelihoodFieldParameters(sigma_hit=0.1)
-    return Sensor(gs.LikelihoodFieldModel(GRID, SCANNER, parameters, beams=beams, backend="numpy"))
+    return Sensor(gs.LikelihoodFieldModel(GRID, FINE, parameters, beams=beams, backend="numpy"))
 
 
 def skipped(ranges, beams=None):
@@ -47,7 +46,7 @@ def test_a_scan_that_no_particle_explains_is_used_whole():
 
 
 def test_particles_that_lie_apart_skip_nothing():
-    field = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
+    field = gs.LikelihoodFieldModel(GRID, FINE, backend="numpy")
     ranges, found = WALLS.copy(), []
     ranges[BLOCKED] = 0.5
     for share in (0.3, None):
@@ -59,7 +58,7 @@ def test_particles_that_lie_apart_skip_nothing():
 
 
 def test_a_filter_skips(backend):
-    field = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    field = gs.LikelihoodFieldModel(GRID, FINE, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
     compass = gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend=backend)
     ranges = WALLS.copy()
     ranges[BLOCKED] = 0.5

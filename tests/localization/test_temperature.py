@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from support.tracking_scene import FINE, GRID, TRUTH, scan_at
 
 import gpusense as gs
 from gpusense.localization import lessons
@@ -114,12 +115,11 @@ def test_scans_that_do_not_follow_and_few_beams_are_not_compared():
 
 def test_models_of_scans_are_calibrated():
     """Errors of beam models of a room are independent, or moving averages of 6 beams (inflation 6)."""
-    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
     scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=np.pi / 180, count=360, range_max=10.0)
-    model = gs.BeamModel(grid, scanner, gs.BeamParameters(0.97, 0.0, 0.0, 0.03, sigma_hit=0.05), backend="numpy")
+    model = gs.BeamModel(GRID, scanner, gs.BeamParameters(0.97, 0.0, 0.0, 0.03, sigma_hit=0.05), backend="numpy")
     rng = np.random.default_rng(2)
     poses = np.column_stack([rng.uniform(3, 5, 30), rng.uniform(2.5, 4, 30), rng.uniform(-3, 3, 30)])
-    exact = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(poses, scanner.bearings)
+    exact = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(poses, scanner.bearings)
     white = exact + 0.05 * rng.normal(size=exact.shape)
     smooth = exact + 0.05 * lfilter(np.full(6, 6**-0.5), [1.0], rng.normal(size=(30, 365)))[:, 5:]
     found = [gs.calibrate_temperature(model, scans, poses) for scans in (white, smooth)]
@@ -138,13 +138,10 @@ def test_models_of_scans_are_calibrated():
 
 
 def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
-    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
-    scanner = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
-    models = [gs.LikelihoodFieldModel(grid, scanner, backend="numpy") for _ in range(2)]
-    pose = np.array([3.0, 2.5, 0.4])
-    ranges = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+    models = [gs.LikelihoodFieldModel(GRID, FINE, backend="numpy") for _ in range(2)]
+    ranges = scan_at(TRUTH, FINE)
     pf = gs.ParticleFilter(models, particles=100, seed=1)
-    pf.initialize(mean=pose, covariance=np.diag([1e-3, 1e-3, 1e-4]))
+    pf.initialize(mean=TRUTH, covariance=np.diag([1e-3, 1e-3, 1e-4]))
     first = pf.temperatures
     for step in range(16):
         pf.correct({models[step % 2]: ranges})
@@ -166,14 +163,12 @@ def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
 
 
 def test_a_correction_after_the_first_scans_does_one_part_of_a_lesson(monkeypatch):
-    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
-    scanner = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
-    pose, parts = np.array([3.0, 2.5, 0.4]), []
-    ranges = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+    parts = []
+    ranges = scan_at(TRUTH, FINE)
     advance = lessons.Learner._advanced
     monkeypatch.setattr(lessons.Learner, "_advanced", lambda my, one: (parts.append(one.stage), advance(my, one))[1])
-    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend="numpy"), particles=100, seed=1)
-    pf.initialize(mean=pose, covariance=np.diag([1e-3, 1e-3, 1e-4]))
+    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(GRID, FINE, backend="numpy"), particles=100, seed=1)
+    pf.initialize(mean=TRUTH, covariance=np.diag([1e-3, 1e-3, 1e-4]))
     done = []
     for _ in range(100):
         parts.clear()

@@ -52,7 +52,7 @@ def test_one_scan(log):
     assert not scan.ranges.flags.writeable
 
 
-@pytest.mark.parametrize("name", ["run.log", "run.clf", "run.log.gz", "compressed.gz"])
+@pytest.mark.parametrize("name", ["run.log", "run.clf", "run.log.gz", "run.gz", "run", "run.mcap.txt"])
 @pytest.mark.parametrize("end", ["\n", "\r\n", ""])
 def test_plain_and_compressed(log, name, end):
     assert len(list(read_log(log(flaser([1.0]), flaser([2.0]), name=name, end=end)))) == 2

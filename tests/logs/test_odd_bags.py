@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import math
 import shutil
 import sqlite3
@@ -97,14 +96,6 @@ def test_first_bytes_decide_the_format(tmp_path: Path, kind: str, name: str) -> 
     assert times(tmp_path / name) == [1.0, 2.0, 3.0]
 
 
-def test_a_bag_that_is_being_recorded_is_read_up_to_its_end(tmp_path: Path) -> None:
-    data = bag_of(tmp_path, "ros1").read_bytes()
-    active = tmp_path / "run.bag.active"
-    active.write_bytes(data[: -len(data) // 8])
-    scans, told = read(active, mount=(0.1, 0.0, 0.0))
-    assert scans and len(told) == 1 and "run.bag.active: the bag is cut off; it is read up to there" in told[0]
-
-
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("metadata", [None, ""])
 def test_a_folder_without_metadata_is_its_files_in_the_order_of_time(tmp_path: Path, kind: str, metadata: Any) -> None:
@@ -140,17 +131,6 @@ def test_compressed_files_of_a_bag_are_read_through_its_folder(tmp_path: Path) -
     (tmp_path / "file/metadata.yaml").unlink()
     with pytest.raises(ValueError, match=r"file\.db3\.zstd: must be decompressed in a folder without metadata\.yaml"):
         read(tmp_path / "file", mount=FLAT)
-
-
-def test_text_logs_keep_their_formats(tmp_path: Path) -> None:
-    text = "FLASER 3 1.0 2.5 8.0 0 0 0 0 0 0 12.5 host 12.5\n"
-    for name, data in (
-        ("run", text.encode()),
-        ("run.mcap.txt", text.encode()),
-        ("run.gz", gzip.compress(text.encode())),
-    ):
-        (tmp_path / name).write_bytes(data)
-        assert times(tmp_path / name, range_max=8.0) == [12.5]
 
 
 # ---- lasers

@@ -10,12 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import BASE, LASER, Writer
+from support.bags import BASE, LASER, Writer, each_kind
 
 import gpusense as gs
-
-KINDS = ("ros1", "sqlite3", "mcap")
-each_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def small_bag(folder: Path, kind: str) -> Path:

@@ -219,7 +219,9 @@ def _find(selection: str) -> str:
     head, colon, rest = selection.partition(":")
     entry = BY_NAME.get(head)
     if entry is None or (colon and not (rest and any(":" in one for one in entry.selections))):
-        forms = [repr(form) for form in ("auto", *(form for one in ENTRIES for form in one.selections))]
+        forms = [
+            repr(form) for form in ("auto", *_KINDS, "cuda", *(form for one in ENTRIES for form in one.selections))
+        ]
         raise ValueError(f"backend: must be {', '.join(forms[:-1])} or {forms[-1]}, got {show(selection)}")
     present, absent = listing.present(entry)
     if not present:

@@ -15,7 +15,7 @@ from gpusense.backends.registry import ENTRIES
 # Backends of tests; with a GPU for example GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
 
-_NAMES = ["auto", *(name for entry in ENTRIES for name in entry.selections)]
+_NAMES = ["auto", "gpu", "cpu", "cuda", *(name for entry in ENTRIES for name in entry.selections)]
 # The error of a selection string that names no device.
 NO_SELECTION = f"backend: must be {', '.join(map(repr, _NAMES[:-1]))} or {_NAMES[-1]!r}, got {{!r}}".format
 

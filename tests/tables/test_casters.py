@@ -184,6 +184,7 @@ def test_a_table_too_large_for_the_device_is_an_error_that_names_sizes(name, nee
 def test_methods_list_every_caster():
     methods = {method.name: method for method in gs.RayCaster.methods()}
     assert list(methods) == list(ENTRIES) == list(casters.CASTERS)
+    assert set(gs.casters.__all__) >= {kind.__name__ for kind in casters.CASTERS.values()}
     for name, method in methods.items():
         words = (method.name, method.error, method.memory, method.precomputation, method.knobs)
         assert all(words)

@@ -135,7 +135,7 @@ def test_time_that_goes_back_may_start_the_filter_again_and_lost_scans_are_count
 
 
 @pytest.mark.parametrize("more, text", [
-    (["--backend", "nosuch"], "nosuch"), (["--ros-args", "-p", "scan_topic:='bad topic'"], "bad topic"),
+    (["--backend", "nosuch"], "nosuch"), ([*ROOM[:2], "--ros-args", "-p", "scan_topic:='bad topic'"], "bad topic"),
     (["--ros-args", "-p", "z_hit:=-1.0"], "z_hit"), (["--ros-args", "-p", "map_file:=/no.yaml"], "no.yaml"),
     (["watch", "--backend", "nosuch"], "nosuch"), (["watch", "--ros-args", "-p", "patience:=0.0"], "patience"),
     (["--ros-args", "-p", "nothing"], "nothing"),

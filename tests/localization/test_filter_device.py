@@ -15,9 +15,9 @@ from gpusense.backends import get_backend
 from gpusense.models import chunking as pieces
 
 
-def begun(backend, variances, **options):
-    """Return a filter at ``POSE``."""
-    model = gs.LikelihoodFieldModel(GRID, FINE, backend=backend)
+def begun(backend, variances, *parameters, **options):
+    """Return a filter at ``POSE``, of a model with given or default parameters."""
+    model = gs.LikelihoodFieldModel(GRID, FINE, *parameters, backend=backend)
     pf = gs.ParticleFilter(model, **{"particles": 300, "seed": 5, "temperature": 0.2} | options)
     pf.initialize(mean=POSE, covariance=np.diag(variances))
     return pf
@@ -210,7 +210,7 @@ def test_a_robot_that_crosses_a_long_map_repeats_its_recordings(warp_as_gpu):
 @pytest.mark.long
 def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
     def run():
-        pf = begun("opencl", (0.1, 0.1, 0.03), particles=(100, 2000))
+        pf = begun("opencl", (0.1, 0.1, 0.03), gs.LikelihoodFieldParameters(), particles=(100, 2000))
         ranges = scan_at(POSE, FINE)
         counts = []
         for _ in range(6):

@@ -1,6 +1,13 @@
 // Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits; see the
 // reference.
 
+// A coordinate or a heading of a pose in memory.
+#if POSES_FLOAT32
+typedef float coordinate;
+#else
+typedef double coordinate;
+#endif
+
 // Quarter turns modulo 4, and the remaining angle as the sum of two numbers.
 typedef struct {
     long quadrant;

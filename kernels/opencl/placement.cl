@@ -2,12 +2,6 @@
 // -, *, /, floor and comparisons are used, so that every device gives the same bits.
 // requires: heading
 
-#if POSES_FLOAT32
-typedef float coordinate;
-#else
-typedef double coordinate;
-#endif
-
 // Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
 #define FARTHEST 1073741824.0
 #if FLOAT64

@@ -2,12 +2,6 @@
 // Differences of large coordinates or of many turns are small, and small numbers keep their digits in any precision.
 // requires: heading
 
-#if POSES_FLOAT32
-typedef float coordinate;
-#else
-typedef double coordinate;
-#endif
-
 // pair_sum of error_free.cl in float64.
 double2 pair_sum_float64(const double2 a, const double2 b) {
     const double2 sum = two_sum_float64(a.x, b.x);

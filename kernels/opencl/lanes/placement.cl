@@ -1,12 +1,6 @@
 // Placement of 8 poses at once: placement.cl, for float32. Coordinates are clamped, so that vectors round them down.
 // requires: lanes/heading
 
-#if POSES_FLOAT32
-typedef float coordinate;
-#else
-typedef double coordinate;
-#endif
-
 // in lanes: FARTHEST within_reach move_to_sensor
 
 #define BELOW_ONE 0x1.fffffep-1f

@@ -63,13 +63,19 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
     return np.where(back, -quadrant, quadrant) & 3, (np.where(back, -high, high), np.where(back, -low, low))
 
 
-def cos_sin(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return cosines and sines of float64 headings; meaningless, but not NaN, for headings that are not finite."""
+def reduce_heading(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
+    """Reduce headings of any size, as :func:`reduce_ordinary` does."""
     huge = ~(np.abs(theta) <= LARGEST_HEADING)
     any_huge = huge.any()
-    quadrant, (r, low) = reduce_ordinary(np.where(huge, 0.0, theta) if any_huge else theta)
+    quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta) if any_huge else theta)
     if any_huge:
-        quadrant[huge], (r[huge], low[huge]) = reduce_huge(theta[huge])
+        quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
+    return quadrant, rest
+
+
+def cos_sin(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosines and sines of float64 headings; meaningless, but not NaN, for headings that are not finite."""
+    quadrant, (r, low) = reduce_heading(theta)
     z = r * r
     half = 0.5 * z
     s = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * S5))))

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import FARTHEST, LARGEST_HEADING
+from gpusense.interface.constants import FARTHEST
 from gpusense.interface.formulas import QUARTER, QUARTER_LOW
 from gpusense.reference.error_free import Pair, pair_sum, two_sum, where_pair
-from gpusense.reference.heading import cos_sin, reduce_huge, reduce_ordinary
+from gpusense.reference.heading import cos_sin, reduce_heading
 
 
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:
     """Return ``theta - target`` in [-pi, pi]; the target is in that interval."""
-    huge = np.abs(theta) > LARGEST_HEADING
-    quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
-    if huge.any():
-        quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
+    quadrant, rest = reduce_heading(theta)
     # Up to three quarters are exact: the last bits of QUARTER are 0.
     quarters = quadrant.astype(np.float64)
     angle = pair_sum((quarters * QUARTER, quarters * QUARTER_LOW), rest)

@@ -88,6 +88,15 @@ Turn reduce_huge(const double theta) {
 }
 #endif
 
+// Reduce a heading of any size; without HUGE_HEADINGS, of at most LARGEST_HEADING.
+Turn reduce_heading(const double theta) {
+#if HUGE_HEADINGS
+    return fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta);
+#else
+    return reduce_ordinary(theta);
+#endif
+}
+
 // Return (cosine, sine) of a reduced heading.
 double2 cos_sin_of(const Turn turn) {
     const double r = turn.rest.x, low = turn.rest.y;
@@ -104,10 +113,4 @@ double2 cos_sin_of(const Turn turn) {
 }
 
 // Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN.
-double2 cos_sin(const double theta) {
-#if HUGE_HEADINGS
-    return cos_sin_of(fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta));
-#else
-    return cos_sin_of(reduce_ordinary(theta));
-#endif
-}
+double2 cos_sin(const double theta) { return cos_sin_of(reduce_heading(theta)); }

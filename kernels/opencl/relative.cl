@@ -10,11 +10,7 @@ double2 pair_sum_float64(const double2 a, const double2 b) {
 
 // Return theta - target in [-pi, pi]; the target is in that interval.
 double2 wrapped_difference(const double theta, const double2 target) {
-#if HUGE_HEADINGS
-    const Turn turn = fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta);
-#else
-    const Turn turn = reduce_ordinary(theta);
-#endif
+    const Turn turn = reduce_heading(theta);
     // Up to three quarters are exact: the last bits of QUARTER are 0.
     const double quarters = (double)turn.quadrant;
     double2 angle = pair_sum_float64((double2)(quarters * QUARTER, quarters * QUARTER_LOW), turn.rest);

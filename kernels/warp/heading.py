@@ -86,8 +86,8 @@ def reduce_huge(theta: wp.float64):
 
 
 @wp.func
-def cos_sin(theta: wp.float64):
-    """Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN."""
+def reduce_heading(theta: wp.float64):
+    """Reduce a heading of any size; without HUGE_HEADINGS, of at most LARGEST_HEADING."""
     quadrant = int(0)
     rest = wp.vec2d()
     if HUGE_HEADINGS:
@@ -97,6 +97,13 @@ def cos_sin(theta: wp.float64):
             quadrant, rest = reduce_huge(theta)
     else:
         quadrant, rest = reduce_ordinary(theta)
+    return quadrant, rest
+
+
+@wp.func
+def cos_sin(theta: wp.float64):
+    """Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN."""
+    quadrant, rest = reduce_heading(theta)
     r = rest.x
     low = rest.y
     z = r * r

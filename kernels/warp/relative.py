@@ -4,9 +4,8 @@ import warp as wp
 
 from gpusense.interface import constants, formulas
 
-from .flags import HUGE_HEADINGS
 from .float64.error_free import pair_sum, two_sum
-from .heading import LARGEST_HEADING, cos_sin, reduce_huge, reduce_ordinary
+from .heading import cos_sin, reduce_heading
 from .prelude import doubles, kernel
 from .types import real, vec2, vec4
 
@@ -20,15 +19,7 @@ MINUS_FOUR = wp.float64(-4.0)
 @wp.func
 def wrapped_difference(theta: wp.float64, target: wp.vec2d):
     """Return theta - target in [-pi, pi]; the target is in that interval."""
-    quadrant = int(0)
-    rest = wp.vec2d()
-    if HUGE_HEADINGS:
-        if wp.abs(theta) <= LARGEST_HEADING:
-            quadrant, rest = reduce_ordinary(theta)
-        else:
-            quadrant, rest = reduce_huge(theta)
-    else:
-        quadrant, rest = reduce_ordinary(theta)
+    quadrant, rest = reduce_heading(theta)
     # Up to three quarters are exact: the last bits of QUARTER are 0.
     quarters = wp.float64(quadrant)
     angle = pair_sum(wp.vec2d(quarters * f.QUARTER, quarters * f.QUARTER_LOW), rest)

@@ -4,7 +4,7 @@
     python bench/speed/worlds.py --backend warp:cuda:0 --worlds 256,1024,4096,8192 --shapes 64 --kernels
 
 Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single room has as many
-robots as the largest number of worlds, up to 4096. Rates time whole calls and, after a slash, bound calls. Models
+robots as the worlds, and takes turns with them. Rates time whole calls and, after a slash, bound calls. Models
 score one scan. Poses, indices and ranges are in a GPU's memory, for processors in the host's. --kernels adds the time
 of each launch by the device's clock. --peers casts lidars among discs in worlds without walls, and runs VMAS and ir-sim
 on the same scene where they are installed.
@@ -60,17 +60,17 @@ def poses_in(worlds: int, rng: np.random.Generator) -> np.ndarray:
 clock: Callable[[], float] = time.perf_counter
 
 
-def least(run: Callable[[], Any], backend: Any, repeats: int, seconds: float) -> float:
-    """Return the least time of a call that has ended [s]."""
-    run()
-    backend.synchronize()
-    best, begin = float("inf"), time.perf_counter()
-    for _ in range(repeats):
-        before = clock()
-        run()
-        backend.synchronize()
-        best = min(best, clock() - before)
-        if time.perf_counter() - begin > seconds:
+def least(backend: Any, repeats: int, seconds: float, *runs: Callable[[], Any]) -> list[float]:
+    """Return the least times of calls that have ended [s]; the calls take turns."""
+    best, begin = [float("inf")] * len(runs), time.perf_counter()
+    for turn in range(repeats + 1):
+        for k, run in enumerate(runs):
+            before = clock()
+            run()
+            backend.synchronize()
+            # The first turn makes what the others keep.
+            best[k] = min(best[k], clock() - before) if turn else best[k]
+        if turn and time.perf_counter() - begin > seconds:
             break
     return best
 
@@ -96,28 +96,14 @@ def shapes_of(worlds: int, count: int, rng: np.random.Generator) -> gs.Shapes:
     return gs.Shapes(discs=discs, boxes=boxes, segments=np.concatenate([begin, begin + 0.5], axis=2))
 
 
-def scoring_rates(place: Any, poses: Any, where: Any, backend: Any, repeats: int, seconds: float) -> np.ndarray:
-    """Return the rates of a beam model and a field that score one scan at all poses [readings/s]."""
+def calls_of(place: Any, poses: Any, where: Any, backend: Any) -> list[Callable[[], Any]]:
+    """Return bound casts, and calls of a beam model and a field with one scan, at all poses in worlds or a map."""
+    options = {} if where is None else {"world": where}
     scanner = gs.Scanner(BEARINGS, range_max=RANGE_MAX)
-    (scan,), found = there(backend, np.random.default_rng(1).uniform(0.5, 9, len(BEARINGS))), []
-    for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
-        model = kind(place, scanner, backend=backend)
-        options = {} if where is None else {"world": where}
-        call = functools.partial(model.log_likelihood, poses, scan, **options)
-        found.append(len(poses) * len(BEARINGS) / least(call, backend, repeats, seconds))
-    return np.array(found)
-
-
-def rates_of_one(backend: Any, worlds: int, repeats: int, seconds: float) -> np.ndarray:
-    """Return the rates of bound casts, a beam model and a field for the robots of some worlds in one room [1/s]."""
-    rng = np.random.default_rng(0)
-    room = gs.OccupancyGrid(rooms(1, rng)[0], RESOLUTION)
-    caster = gs.RayCaster(room, RANGE_MAX, backend=backend)
-    (poses,) = there(backend, poses_in(worlds, rng))
-    cast = len(poses) * len(BEARINGS) / least(caster.bind(poses, BEARINGS), backend, repeats, seconds)
-    rates = np.array([cast, *scoring_rates(room, poses, None, backend, repeats, seconds)])
-    note(f"one room: {', '.join(f'{rate / 1e6:.0f}' for rate in rates)} M rays, readings of a beam model, a field/s")
-    return rates
+    (scan,) = there(backend, np.random.default_rng(1).uniform(0.5, 9, len(BEARINGS)))
+    models = [kind(place, scanner, backend=backend) for kind in (gs.BeamModel, gs.LikelihoodFieldModel)]
+    bound = gs.RayCaster(place, RANGE_MAX, backend=backend).bind(poses, BEARINGS, **options)
+    return [bound, *(functools.partial(model.log_likelihood, poses, scan, **options) for model in models)]
 
 
 def by_events(device: Any, launches: list[Callable[[], None]]) -> list[tuple[str, float]]:
@@ -171,8 +157,8 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure single maps, then each number of worlds."""
     backend, rng, rows = get_backend(arguments.backend), np.random.default_rng(0), []
     numbers = [int(number) for number in arguments.worlds.split(",")]
-    repeats, seconds, few = arguments.repeats, arguments.seconds, min(max(numbers), 4096)
-    room = rates_of_one(backend, few, repeats, seconds)
+    turns = backend, arguments.repeats, arguments.seconds
+    room = gs.OccupancyGrid(rooms(1, rng)[0], RESOLUTION)
     for count in numbers:
         recorder = Recorder(backend) if arguments.kernels else backend
         kinds = rooms(min(count, 256), rng)
@@ -196,19 +182,17 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         for shapes in sorted({0, arguments.shapes}):
             if shapes:
                 worlds.shapes = shapes_of(count, shapes, rng)
-            rate, replaced = rays / least(cast, backend, repeats, seconds), least(replace, backend, repeats, seconds)
-            call = caster.bind(poses, BEARINGS, world=where)
-            call()
-            bound = rays / least(call, backend, repeats, seconds)
-            scored = scoring_rates(worlds, poses, where, backend, repeats, seconds)
+            (whole,), (replaced,) = least(*turns, cast), least(*turns, replace)
+            pairs = zip(calls_of(worlds, poses, where, recorder), calls_of(room, poses, None, backend), strict=True)
+            each = [least(*turns, *pair) for pair in pairs]
+            rates, of_room = [1e-6 * rays / one for one, _ in each], [one_room / one for one, one_room in each]
             rows.append(dict(
-                worlds=count, shapes=shapes, rate=rate / 1e6, bound=bound / 1e6, of_room=bound / room[0],
-                scored=(scored / 1e6).tolist(), scored_of_room=(scored / room[1:]).tolist(),
+                worlds=count, shapes=shapes, rate=1e-6 * rays / whole, rates=rates, of_room=of_room,
                 made=1e3 * made, replaced=1e3 * replaced, bytes=worlds.nbytes / (count * SIDE * SIDE),
                 launches="; ".join(timed(recorder, run) for run in (cast, replace)),
             ))  # fmt: skip
             note(" | ".join(line_of(rows[-1])))
-        del worlds, caster, cast, replace, call
+        del worlds, caster, cast, replace, pairs
     return rows
 
 
@@ -236,8 +220,8 @@ def peers(arguments: argparse.Namespace) -> list[tuple[str, ...]]:
         worlds.collides(placed, 0.2, world=where)
 
     def rates(measure: Callable[[], Any], step: Callable[[], Any], lidars: int) -> tuple[str, ...]:
-        each = (lidars / least(run, backend, arguments.repeats, arguments.seconds) for run in (measure, step))
-        return str(lidars), *(f"{rate:.3g}" for rate in each)
+        each = (least(backend, arguments.repeats, arguments.seconds, run)[0] for run in (measure, step))
+        return str(lidars), *(f"{lidars / taken:.3g}" for taken in each)
 
     lines = []
     for name, program in (("vmas", vmas_program), ("irsim", ir_sim_program)):
@@ -310,8 +294,8 @@ obstacle:
 
 def line_of(row: dict[str, Any]) -> list[str]:
     """Return the cells of a row."""
-    text = "{worlds}|{shapes}|{rate:.0f} / {bound:.0f}|{of_room:.2f}|{scored[0]:.0f} / {scored[1]:.0f}|"
-    text += "{scored_of_room[0]:.2f} / {scored_of_room[1]:.2f}|{made:.2f}|{replaced:.2f}|{bytes:.1f}|"
+    text = "{worlds}|{shapes}|{rate:.0f} / {rates[0]:.0f}|{of_room[0]:.2f}|{rates[1]:.0f} / {rates[2]:.0f}|"
+    text += "{of_room[1]:.2f} / {of_room[2]:.2f}|{made:.2f}|{replaced:.2f}|{bytes:.1f}|"
     return [*text.format(**row).split("|")[:-1], row["launches"]]
 
 

@@ -127,7 +127,8 @@ class Robot:
         return self.got[topic]
 
     def poses(self) -> list[Any]:
-        return self.listen(PoseWithCovarianceStamped, "amcl_pose")
+        """Return the node's poses, with the last one from before the first call."""
+        return self.listen(PoseWithCovarianceStamped, "amcl_pose", latched())
 
     def publisher(self, kind: Any, topic: str, quality: Any = 100) -> Any:
         if topic not in self.publishers:

@@ -31,7 +31,7 @@ from gpusense.matching.options import UNSETTLED, Best, Levels, MatchOptions, nea
 from gpusense.matching.points import ScanPoints, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.verdicts import PairSums, concluded, pair_evidence, statuses, tested
-from gpusense.world.pose_algebra import invert_poses
+from gpusense.world.pose_algebra import inverted
 from gpusense.world.scanner import Scanner
 
 # Scores below the first value start a search of the window. Scores below the second one start a search near the guess
@@ -186,7 +186,7 @@ def is_held(
     each = np.repeat(match.pose[:, None], starts.shape[1], axis=1) + starts
     shape = each.shape
     seen = to_sensor(each.reshape(-1, 3), scanner.mount[:2])
-    guesses = np.concatenate([seen.reshape(shape), invert_poses(seen).reshape(shape)])
+    guesses = np.concatenate([seen.reshape(shape), inverted(seen).reshape(shape)])
     noise = np.tile(match.noise, 2)
     lock, space = space_of(backend)
     with lock, space:
@@ -196,7 +196,7 @@ def is_held(
             for level, (_, most) in zip(device.levels, device.most_points(), strict=True)
         ]
         found = device.run(np.arange(2 * count), guesses, rules, columns=4)[..., :3].astype(np.float64)
-    there, back = found[:count].reshape(-1, 3), invert_poses(found[count:].reshape(-1, 3))
+    there, back = found[:count].reshape(-1, 3), inverted(found[count:].reshape(-1, 3))
     wanted = to_sensor(match.pose, scanner.mount[:2])[:, None]
     held = np.ones(count, bool)
     for poses in (there, back):

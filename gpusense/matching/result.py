@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gpusense._util.html import card, pose_rows
 from gpusense._util.typing import Floats
 from gpusense.matching.observability import covariance_of
-from gpusense.world.pose_algebra import compose_poses, rotations
+from gpusense.world.pose_algebra import composed, rotations
 
 STATUSES = {
     "converged": "the scans agree, and every direction of the pose is observed",
@@ -138,7 +138,7 @@ class ScanMatch:
 
         ``reach`` is the farthest distance [m] and angle [rad] from a guess, see ``covariance_of``.
         """
-        pose, turned = compose_poses(frame, self.pose), rotations(frame[:, 2])
+        pose, turned = composed(frame, self.pose), rotations(frame[:, 2])
         information = turned @ self.information @ turned.transpose(0, 2, 1)
         directions = self.directions @ turned.transpose(0, 2, 1)
         covariance = covariance_of(information, self.lever, reach)

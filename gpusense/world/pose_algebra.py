@@ -51,14 +51,15 @@ def compose_poses(first: AnyArray, second: AnyArray) -> np.ndarray:
         >>> gs.compose_poses([1.0, 2.0, np.pi / 2], [1.0, 0.0, 0.0]).round(3).tolist()
         [1.0, 3.0, 1.571]
     """
-    return _composed(*_pair("first", first, "second", second))
+    return composed(*_pair("first", first, "second", second))
 
 
-def _composed(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+def composed(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Return the product of poses (..., 3); not checked, so that NaN stays NaN."""
     cosine, sine = np.cos(one[..., 2]), np.sin(one[..., 2])
     x = one[..., 0] + cosine * two[..., 0] - sine * two[..., 1]
     y = one[..., 1] + sine * two[..., 0] + cosine * two[..., 1]
-    return np.stack([x, y, wrap_angle(one[..., 2] + two[..., 2])], axis=-1)
+    return np.stack([x, y, wrapped(one[..., 2] + two[..., 2])], axis=-1)
 
 
 def invert_poses(poses: AnyArray) -> np.ndarray:
@@ -75,14 +76,15 @@ def invert_poses(poses: AnyArray) -> np.ndarray:
         >>> gs.invert_poses([1.0, 2.0, np.pi / 2]).round(3).tolist()
         [-2.0, 1.0, -1.571]
     """
-    return _inverted(_poses("poses", poses))
+    return inverted(_poses("poses", poses))
 
 
-def _inverted(pose: np.ndarray) -> np.ndarray:
+def inverted(pose: np.ndarray) -> np.ndarray:
+    """Return the inverses of poses (..., 3); not checked, so that NaN stays NaN."""
     cosine, sine = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = -cosine * pose[..., 0] - sine * pose[..., 1]
     y = sine * pose[..., 0] - cosine * pose[..., 1]
-    return np.stack([x, y, wrap_angle(-pose[..., 2])], axis=-1)
+    return np.stack([x, y, wrapped(-pose[..., 2])], axis=-1)
 
 
 def pose_difference(before: AnyArray, after: AnyArray) -> np.ndarray:
@@ -101,7 +103,7 @@ def pose_difference(before: AnyArray, after: AnyArray) -> np.ndarray:
         [2.0, 0.0, 1.571]
     """
     one, two = _pair("before", before, "after", after)
-    return _composed(_inverted(one), two)
+    return composed(inverted(one), two)
 
 
 def mean_pose(poses: AnyArray, weights: AnyArray | None = None) -> np.ndarray:

@@ -107,3 +107,19 @@ def test_starts_have_the_noise_of_the_match(monkeypatch, noise):
     monkeypatch.setattr(icp_with_search, "IcpPairs", lambda *given: (used.extend(given[4]), made(*given))[1])
     icp_with_search.is_held(one, two, FRONT, match, get_backend("numpy"), "float32")
     assert used == [noise] * 4
+
+
+@pytest.mark.parametrize("first", [0, 2], ids=["there", "back"])
+def test_a_start_that_ends_nowhere_is_not_held(monkeypatch, first):
+    """A device may return NaN for a start whose equations have no solution."""
+    one, two = pairs([CORRIDOR, CORRIDOR], np.array([0.1, 0.0, 0.0]), FRONT)
+    match = gs.match_scan(one, two, FRONT, backend="numpy")
+    run = icp_with_search.IcpPairs.run
+
+    def broken(*arguments, **options):
+        found = run(*arguments, **options)
+        found[first : first + 2] = np.nan
+        return found
+
+    monkeypatch.setattr(icp_with_search.IcpPairs, "run", broken)
+    assert not icp_with_search.is_held(one, two, FRONT, match, get_backend("numpy"), "float32").any()

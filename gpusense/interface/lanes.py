@@ -81,8 +81,8 @@ def with_teams_flags(
 # A file in ``kernels/opencl/lanes`` says ``// in lanes: STEP two_sum ordered_sum`` in place of these functions, structs
 # and macros; they are taken from the scalar file of its name or from a file that it requires. Numbers become vectors by
 # ``TYPES``; a function or struct ``name`` for which there is a ``name_lanes`` becomes that one. Numbers in memory stay
-# what they are. A text that serves both chooses by ``?:``, keeps comparisons as ``integer``, or as ``long`` beside
-# ``double``, and calls functions of numbers alone. Macros and kernels are taken as they stand.
+# what they are. A text for numbers and vectors chooses by ``?:`` and calls functions of numbers alone. It stores
+# comparisons of ``real`` as ``integer``, and of ``double`` as ``long``. Macros and kernels are taken as they stand.
 
 
 TYPES = {

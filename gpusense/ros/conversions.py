@@ -98,7 +98,7 @@ class CommonBeams:
     """Readings of a laser's scans on the beams of one ``scanner``, as in logs.
 
     The first scan's geometry is the scanner. After a scan of another geometry, all scans move to common bearings, so
-    that varying beams need only a second scanner. A mount that moves needs another one each time. Readings of 0 are
+    that varying beams need only a second scanner. Each move of the mount needs a new scanner. Readings of 0 are
     missing, and each scan keeps its limits.
     """
 

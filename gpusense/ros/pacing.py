@@ -48,8 +48,8 @@ class Rest:
 class Losses:
     """Count the messages of a topic that were lost, by the numbers of their publications.
 
-    Each publisher has numbers of its own, and some releases of ROS do not name the publisher. A number follows the
-    nearest one at or below it. A middleware without numbers shows no losses.
+    Publishers number their messages separately, and some releases of ROS do not name the publisher. A number follows
+    the nearest one at or below it. A middleware without numbers shows no losses.
     """
 
     def __init__(self) -> None:

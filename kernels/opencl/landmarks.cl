@@ -145,7 +145,7 @@ real log_detection(const real4 off, const real4 turned, global const real *featu
 #else
         const real seen = 1;
 #endif
-        // Without a bearing the density is 1 / field: the peak times zero_range_density and the scale.
+        // The density of a missing bearing is 1 / field: the peak times zero_range_density and the scale.
         const real anywhere = terms->zero_range_density * feature[BEARING_SCALE];
         mass = mass * (has_bearing ? seen : anywhere);
     }

@@ -193,7 +193,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
 
 
 def compared(backend, lanes, count=1500, **options):
-    """Return the buffers of a backend, which have the bits of the reference."""
+    """Check that a backend computes the bits of the reference; return its buffers."""
     expected, found = run_step("numpy", count, **options), run_step(backend, count, lanes=lanes, **options)
     for name, values in expected.items():
         assert np.array_equal(values, found[name], equal_nan=True), name

@@ -72,8 +72,9 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
 // Particles that fetch a table together.
 #define FETCHERS 16
 
-// Return a part, of the parts of a particle, of the table of the world in which the next FETCHERS particles begin.
-// Particles that change worlds one by one, or cast few rays in large worlds, fetch nothing.
+// Return a particle's share of the lines of the next world's table, if the next FETCHERS particles begin there; ``part``
+// is one of the ``parts`` of that share. No line is fetched if each particle is in another world, or if few rays are
+// cast in a large world.
 Lines next_table(global const entry *tables, global const int2 *world, const int n, const int particles, const int part,
                  const int parts, const int rays) {
     const int next = (n | (FETCHERS - 1)) + 1;

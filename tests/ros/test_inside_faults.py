@@ -36,14 +36,26 @@ def refused(robot: Any, send: Any, *texts: str, name: str = "amcl: filter") -> N
     assert status.hardware_id == name.partition(":")[0]
 
 
-def ready(robot: Any, *topics: str) -> None:
+def number(status: Any, *keys: str) -> int:
+    """Return the sum of a status's values."""
+    return sum(int(pair.value) for pair in status.values if pair.key in keys)
+
+
+def ready(robot: Any) -> None:
     """Wait until the node listens, with a map and a mount."""
     robot.map()
     robot.transform(0.0, "base_footprint", "laser", 0.1, static=True)
     robot.transform(0.9, "odom", "base_footprint", 0.0)
     robot.scan(0.0)
     robot.initial_pose(1.0)
-    robot.connected("map", "/tf_static", "/tf", "scan", "initialpose", *topics)
+    robot.connected("map", "/tf_static", "/tf", "scan", "initialpose")
+
+
+def heard(robot: Any) -> None:
+    """Wait until scans arrive: a publisher may know the node before the node knows it."""
+    key, names = "scans received", (lambda one: "robot2" not in one.name)
+    before = number(robot.status("amcl: filter", names), key)
+    robot.status("amcl: filter", lambda one: names(one) and number(one, key) > before, send=lambda: robot.scan(0.0))
 
 
 def test_faults_are_reported_and_the_node_goes_on(robot: Any, tmp_path: Path) -> None:
@@ -60,6 +72,7 @@ def test_faults_are_reported_and_the_node_goes_on(robot: Any, tmp_path: Path) ->
             refused(robot, lambda change=change: robot.map(**change), "map:")
         assert node.alive()
         ready(robot)
+        heard(robot)
         robot.status("amcl: filter", lambda one: one.message.startswith(("no estimate", "no scan")))
         robot.drive([1.0, 1.1, 1.2])
         assert abs(last_x(robot, 1.2) - 1.2) < 0.1
@@ -112,6 +125,7 @@ def test_time_that_goes_back_may_start_the_filter_again_and_lost_scans_are_count
     with started(tmp_path / "log", *START, "-p", "restart_after_jump:=true") as node:
         robot.poses()
         ready(robot)
+        heard(robot)
         robot.drive([30.0, 30.1])
         last_x(robot, 30.1)
         robot.transform(1.0, "odom", "base_footprint", 7.0)
@@ -119,14 +133,13 @@ def test_time_that_goes_back_may_start_the_filter_again_and_lost_scans_are_count
         assert abs(last_x(robot, 1.0) - 1.0) < 0.1
 
         def known(status: Any) -> int:
-            counts = {pair.key: pair.value for pair in status.values}
-            return int(counts["scans received"]) + int(counts["scans lost before the callback"])
+            return number(status, "scans received", "scans lost before the callback")
 
         before, sent = known(robot.status("amcl: filter", lambda one: True)), [0]
 
-        def send(number: int) -> None:
-            sent[0] += number
-            for _ in range(number):
+        def send(count: int) -> None:
+            sent[0] += count
+            for _ in range(count):
                 robot.publishers["scan"].publish(robot.last)
 
         send(400)
@@ -172,6 +185,7 @@ def test_the_lifecycle_and_two_robots(robot: Any, tmp_path: Path) -> None:
     ):
         assert robot.change("CONFIGURE") and robot.change("ACTIVATE")
         ready(robot)
+        heard(robot)
         robot.drive([1.0, 1.1])
         last_x(robot, 1.1)
         assert robot.change("DEACTIVATE") and robot.state() == "inactive"
@@ -179,6 +193,7 @@ def test_the_lifecycle_and_two_robots(robot: Any, tmp_path: Path) -> None:
         assert robot.change("CLEANUP") and robot.state() == "unconfigured"
         assert robot.change("CONFIGURE") and robot.change("ACTIVATE")
         ready(robot)
+        heard(robot)
         robot.drive([1.0, 1.1])
         last_x(robot, 1.1)
         assert max(stamp_of("pose", one) for one in robot.poses()) < 1.15

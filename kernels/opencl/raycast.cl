@@ -34,10 +34,11 @@ int sector_of(const real speed_x, const real speed_y) {
 
 // Rows of a group of the planes; without ROW_GROUPS a group is a single row.
 #if ROW_GROUPS
-#define GROUP 8
+#define GROUP_BITS 3
 #else
-#define GROUP 1
+#define GROUP_BITS 0
 #endif
+#define GROUP (1 << GROUP_BITS)
 
 // The track of a ray through a plane: index of the origin's column, the origin's row, and steps in x and y,
 // so that boundaries COUNT + k need no conversion; skip is what a group has beyond its first column.

@@ -7,7 +7,7 @@
 // Cast rays: one work-item takes a particle and WORK_RAYS rays.
 kernel void cast_ranges(ARGUMENTS) {
     const int begin = WORK_RAYS * get_global_id(0), n = get_global_id(1);
-    if (n >= particles) return;
+    if (begin >= rays || n >= particles) return;
     Lines ahead = {0, 0};
 #if WORLDS
     const Window seen = world_window(world, n);
@@ -36,5 +36,5 @@ kernel void cast_ranges(ARGUMENTS) {
             for (int i = 0; first + i < rays; ++i) out[i] = single[i];
         }
     }
-    fetch_lines(&ahead, INT_MAX);
+    while (ahead.next < ahead.end) fetch_lines(&ahead, STEP_LINES);
 }

@@ -40,7 +40,7 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
         const ilanes x = as_ilanes(k_x) - FIRST_BITS, y = as_ilanes(k_y) - FIRST_BITS;
 #if ROW_GROUPS
         const ilanes row = cell.y + 1 + step_y * y;
-        const ilanes at = going ? origin + step_x * x + row + row / GROUP * (stride - GROUP) : (ilanes)0;
+        const ilanes at = going ? origin + step_x * x + row + (row >> GROUP_BITS) * (stride - GROUP) : (ilanes)0;
 #else
         const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
 #endif

@@ -58,10 +58,13 @@ def test_neighbours_in_an_order_are_near(device: Backend) -> None:
         ("order_fill", count, bin_of, bins, order, count),
     ):
         device.compile(kernel, frozenset())((size,), *arguments)
-    found = device.download(order, np.empty(count, np.int32))
+    found, bin = (device.download(each, np.empty(count, np.int32)) for each in (order, bin_of))
     np.testing.assert_array_equal(np.sort(found), np.arange(count))
+    # Concurrent threads exchange stretches of bins, and neighbours within a bin.
+    for each in (bin, bin // STRETCH):
+        assert np.count_nonzero(np.diff(each[found])) == len(np.unique(each)) - 1
     places = np.column_stack([cell, pose[:, 2:]])
-    apart, before = (np.abs(np.diff(each, axis=0)).mean(axis=0) for each in (places[found], places))
-    # Concurrent threads exchange neighbours within a bin.
+    in_bins = places[np.argsort(bin, kind="stable")]
+    apart, before = (np.abs(np.diff(each, axis=0)).mean(axis=0) for each in (in_bins, places))
     assert (apart[:2] < 0.3 * before[:2]).all()
     assert (apart < 0.9 * before).all()

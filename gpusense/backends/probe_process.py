@@ -6,7 +6,9 @@ a number that it was sent.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import gc
 import glob
 import importlib
 import json
@@ -206,6 +208,8 @@ def _describe(code: int, words: str) -> str:
 
 def main(job: dict[str, Any]) -> None:
     """Do a job in this process, the child."""
+    # At its end, Python would look for cycles among all objects of the libraries, which can take a second.
+    atexit.register(gc.freeze)
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import difflib
+import gc
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -177,6 +179,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal,
         141 after the reader of standard output has gone, or a code of the command.
     """
+    if argv is None:
+        # At its end, Python would look for cycles among all objects of the libraries, which can take a second.
+        atexit.register(gc.freeze)
     _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         # Device names may contain characters outside the terminal's encoding.

@@ -181,6 +181,12 @@ def test_module_is_the_command(tmp_path):
     assert done.stderr == "gpusense: error: argument --seed: must be an integer >= 0, got 'x'\n"
 
 
+def test_no_garbage_is_collected_at_the_end_of_a_command(tmp_path):
+    code = "import atexit, gc; atexit.register(lambda: print('frozen:', gc.get_freeze_count() > 0)); "
+    code += "sys.argv = ['gpusense', '--version']; from gpusense.commands.cli import main; main()"
+    assert script(code, cwd=tmp_path).stdout.endswith("frozen: True\n")
+
+
 def test_devices_as_json(capsys):
     assert cli.main(["devices", "--json"]) == 0
     out, err = capsys.readouterr()

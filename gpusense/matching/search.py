@@ -152,22 +152,23 @@ class _Run:
         headings = grid.headings if grid.headings.strides[0] else grid.headings[:1]
         turned = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
         turned = turned if len(turned) == len(each) else turned.repeat(len(each), axis=0)
-        given = [ends, turned, grid.start.astype(np.float64), first]
+        given = [ends, turned, grid.start.astype(np.float64)]
+        whole = [first]
         if images is not None:
             named = [np.broadcast_to(part, (self._turns, count))[:, order].reshape(-1)
                      for part, count, order in zip(images, each, orders, strict=True)]  # fmt: skip
             named.append(np.zeros(total - int(first[-1]), np.int32))
-            given.append(np.concatenate(named).astype(np.int32))
+            whole.append(np.concatenate(named).astype(np.int32))
         # The host places them for devices without float64.
         backend = self._backend if self._backend.info.float64 else get_backend("numpy")
         there = space if backend is self._backend else Workspace(backend)
         # Some devices wait for launches before they copy, so all numbers are copied first.
-        self._low = space.upload("low", np.maximum(self._floor, 0).astype(np.int32))
-        self._slacks = space.upload("slack", self._slack)
-        self._histogram = space.upload("histogram", np.zeros(len(self._best) * BINS, np.int32))
-        self._clear_counts()
-        inputs = [there.upload(name, array) for name, array in zip(_GIVEN, given, strict=False)]
-        if len(given) < len(_GIVEN):
+        zeros = (np.zeros(size, np.int32) for size in (len(self._best) * BINS, self._level + 1))
+        bounds = [np.maximum(self._floor, 0).astype(np.int32), self._slack, *zeros]
+        together = [*bounds, *whole] if there is space else bounds
+        self._low, self._slacks, self._histogram, self._counts, *more = space.upload_all("search", together)
+        inputs = [*there.upload_all("ends", given), *(more or there.upload_all("ends", whole))]
+        if images is None:
             inputs.append(there.empty("table 0", total, _INT, zero=True))
         made = [there.empty(name, size * total, _INT) for name, size in _MADE.items()]
         folded = tables.folded(self._level)

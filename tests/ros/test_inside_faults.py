@@ -52,7 +52,8 @@ def ready(robot: Any) -> None:
 
 
 def heard(robot: Any) -> None:
-    """Wait until scans arrive: a publisher may know the node before the node knows it."""
+    """Make the node ready, and wait until scans arrive: a publisher may know the node before the node knows it."""
+    ready(robot)
     key, names = "scans received", (lambda one: "robot2" not in one.name)
     before = number(robot.status("amcl: filter", names), key)
     robot.status("amcl: filter", lambda one: names(one) and number(one, key) > before, send=lambda: robot.scan(0.0))
@@ -71,7 +72,6 @@ def test_faults_are_reported_and_the_node_goes_on(robot: Any, tmp_path: Path) ->
         for change in ({"data": [0] * 5}, {"resolution": 0.0}, {"width": 0, "height": 0, "data": []}):
             refused(robot, lambda change=change: robot.map(**change), "map:")
         assert node.alive()
-        ready(robot)
         heard(robot)
         robot.status("amcl: filter", lambda one: one.message.startswith(("no estimate", "no scan")))
         robot.drive([1.0, 1.1, 1.2])
@@ -124,7 +124,6 @@ def test_faults_are_reported_and_the_node_goes_on(robot: Any, tmp_path: Path) ->
 def test_time_that_goes_back_may_start_the_filter_again_and_lost_scans_are_counted(robot: Any, tmp_path: Path) -> None:
     with started(tmp_path / "log", *START, "-p", "restart_after_jump:=true") as node:
         robot.poses()
-        ready(robot)
         heard(robot)
         robot.drive([30.0, 30.1])
         last_x(robot, 30.1)
@@ -184,7 +183,6 @@ def test_the_lifecycle_and_two_robots(robot: Any, tmp_path: Path) -> None:
         started(tmp_path / "two", *START, *names) as other,
     ):
         assert robot.change("CONFIGURE") and robot.change("ACTIVATE")
-        ready(robot)
         heard(robot)
         robot.drive([1.0, 1.1])
         last_x(robot, 1.1)
@@ -192,7 +190,6 @@ def test_the_lifecycle_and_two_robots(robot: Any, tmp_path: Path) -> None:
         robot.drive([1.2, 1.3], first=0.2)
         assert robot.change("CLEANUP") and robot.state() == "unconfigured"
         assert robot.change("CONFIGURE") and robot.change("ACTIVATE")
-        ready(robot)
         heard(robot)
         robot.drive([1.0, 1.1])
         last_x(robot, 1.1)

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends import get_backend
+from gpusense.backends import Backend, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import RUN, SHIFT_ROWS, TOP
 from gpusense.interface.flags import flags_if
+from gpusense.interface.signatures import KERNELS, team_of
 from gpusense.interface.structs import ScoreTable
 from gpusense.matching.pose_grid import Found, PoseGrid
 from gpusense.matching.score_tables import ScoreTables, cells_of
@@ -55,6 +56,7 @@ class Search:
         self.tables = tables
         self.space = Workspace(tables.backend)
         self.launcher = functools.cache(tables.backend.compile)
+        self.team, self.flags = _team_of(tables.backend)
         self.room = 0
         self._masks: tuple[np.ndarray | None, tuple[int, ...], list[Buffer]] = (None, (), [])
 
@@ -134,6 +136,7 @@ class _Run:
         else:
             self._lines = self._items * self._width, self._width, self._height, 1, self._width
         self._ahead = flags_if(READ_AHEAD=self._backend.info.kind == "gpu")
+        self._team, self._in_teams = search.team, search.flags
 
     def _launch(self, kernel: str, size: tuple[int, ...], *arguments: Any, flags: frozenset[str] = _NO_FLAGS) -> None:
         self._search.launcher(kernel, flags)(size, *arguments)
@@ -251,8 +254,9 @@ class _Run:
         for level in reversed(range(self._level)):
             quarters, shape, spacing = self._quarters(level)
             self._launch(
-                "follow_blocks", (count,), *quarters, self._allowed[level], blocks, shape, count, self._grid.height,
-                self._grid.width, -(-self._grid.width >> level), level, *spacing, flags=self._ahead,
+                "follow_blocks", (count * self._team,), *quarters, self._allowed[level], blocks, shape, count,
+                self._grid.height, self._grid.width, -(-self._grid.width >> level), level, *spacing,
+                flags=self._in_teams,
             )  # fmt: skip
         self._launch("raise_low", (count,), blocks, self._slacks, self._low, count, most)
         self._evaluated += 4 * self._level * count
@@ -279,7 +283,7 @@ class _Run:
                 "divide_blocks", (workers,), *quarters, self._allowed[level], blocks, self._low, parts, self._counts,
                 shape, begin if first else 0, min(some, self._room) if first else self._parts, self._parts, workers,
                 run, self._grid.height, self._grid.width, -(-self._grid.width >> level), self._turns, level, *spacing,
-                flags=self._ahead,
+                flags=self._in_teams,
             )  # fmt: skip
             blocks = parts
         self._poses = blocks
@@ -351,6 +355,16 @@ class _Run:
         """Return the poses in falling order of score."""
         scan, row, col, heading, score = self._ordered()
         return Found(scan, row, col, heading, score, self._evaluated, self._complete)
+
+
+def _team_of(backend: Backend) -> tuple[int, frozenset[str]]:
+    """Return how many work-items share the points of a block, and the flags of kernels that divide blocks."""
+    ahead = flags_if(READ_AHEAD=backend.info.kind == "gpu")
+    flags = ahead | {"IN_TEAMS"}
+    team = team_of(KERNELS["divide_blocks"], flags)
+    if ahead and all(team <= backend.largest_group(name, flags) for name in ("divide_blocks", "follow_blocks")):
+        return team, flags
+    return 1, ahead
 
 
 def _rounded(count: int) -> int:

@@ -33,11 +33,12 @@ def damped_step(climb: np.ndarray) -> np.ndarray:
 
 
 def climb_step(
-    flags, gradient, poses, climb, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos, yaw_sin,
-    frame, window,
+    flags, gradient, poses, climb, moved, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos,
+    yaw_sin, frame, window,
 ):  # fmt: skip
     """Judge the poses that were evaluated, numbers in the grid's frame, and take and place each climb's next step."""
-    everyone, tried = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
+    everyone, tried = moved[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
+    everyone[...] = climb[: CLIMB * scans].reshape(scans, CLIMB)
     rows = np.flatnonzero(everyone[:, ENDED] == 0)
     at, trial = everyone[rows], tried[rows, 0]
     numbers = gradient[: GRADIENT_NUMBERS * parts * scans].reshape(scans, parts, -1)[rows].sum(axis=1, dtype=np.float64)

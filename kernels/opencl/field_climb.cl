@@ -20,8 +20,8 @@
 #define LEAST 1e-6
 
 // Solve for the step that damping allows, of at most the longest length and turn.
-void damped_step(global const double *climb, double *step) {
-    global const double *i = climb + MATRIX, *g = climb + SLOPE;
+void damped_step(const double *climb, double *step) {
+    const double *i = climb + MATRIX, *g = climb + SLOPE;
     const double mean = 0.5 * (i[0] + i[3]), most = mean > i[5] ? mean : i[5];
     const double damping = climb[DAMPING], least = LEAST * (1 + most);
     const double a = i[0] + damping * mean + least, d = i[3] + damping * mean + least, f = i[5] + damping * i[5] + least;
@@ -38,43 +38,48 @@ void damped_step(global const double *climb, double *step) {
 
 // Judge the poses that were evaluated, and take the next step of each climb. Each scan has parts neighbouring poses, all
 // equal, whose numbers in the grid's frame are added. The next poses are placed as place_poses does. Poses of climbs that
-// have ended stay. One work-item takes a scan.
+// have ended stay. One work-item takes a part of a scan; the first part writes the climb.
 kernel void climb_step(ARGUMENTS) {
-    const int n = get_global_id(0);
-    if (n >= scans || climb[CLIMB * n + ENDED] != 0) return;
-    global double *at = climb + CLIMB * n, *tried = poses + 3 * parts * n;
-    double numbers[GRADIENT_NUMBERS] = {0};
-    for (int part = 0; part < parts; ++part)
-        for (int k = 0; k < GRADIENT_NUMBERS; ++k) numbers[k] += gradient[GRADIENT_NUMBERS * (parts * n + part) + k];
-    const double off_x = tried[0] - at[0], off_y = tried[1] - at[1], turn = fabs(tried[2] - at[2]);
-    const double far_x = tried[0] - at[START], far_y = tried[1] - at[START + 1];
-    const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
-    const bool better = first || (numbers[0] >= at[VALUE] && within);
-    if (better) {
-        const double c = yaw_cos, s = yaw_sin, x = numbers[1], y = numbers[2];
-        const double xx = numbers[4], xy = numbers[5], yy = numbers[8], xt = numbers[6], yt = numbers[9];
-        for (int k = 0; k < 3; ++k) at[k] = tried[k];
-        at[VALUE] = numbers[0];
-        at[SLOPE] = c * x - s * y;
-        at[SLOPE + 1] = s * x + c * y;
-        at[SLOPE + 2] = numbers[3];
-        at[MATRIX] = c * c * xx - 2 * c * s * xy + s * s * yy;
-        at[MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy;
-        at[MATRIX + 2] = c * xt - s * yt;
-        at[MATRIX + 3] = s * s * xx + 2 * c * s * xy + c * c * yy;
-        at[MATRIX + 4] = s * xt + c * yt;
-        at[MATRIX + 5] = numbers[12];
+    const int own = get_global_id(0), n = own / parts;
+    if (n >= scans) return;
+    double at[CLIMB];
+    for (int k = 0; k < CLIMB; ++k) at[k] = climb[CLIMB * n + k];
+    if (at[ENDED] == 0) {
+        global double *tried = poses + 3 * own;
+        double numbers[GRADIENT_NUMBERS] = {0};
+        for (int part = parts * n; part < parts * (n + 1); ++part)
+            for (int k = 0; k < GRADIENT_NUMBERS; ++k) numbers[k] += gradient[GRADIENT_NUMBERS * part + k];
+        const double off_x = tried[0] - at[0], off_y = tried[1] - at[1], turn = fabs(tried[2] - at[2]);
+        const double far_x = tried[0] - at[START], far_y = tried[1] - at[START + 1];
+        const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
+        const bool better = first || (numbers[0] >= at[VALUE] && within);
+        if (better) {
+            const double c = yaw_cos, s = yaw_sin, x = numbers[1], y = numbers[2];
+            const double xx = numbers[4], xy = numbers[5], yy = numbers[8], xt = numbers[6], yt = numbers[9];
+            for (int k = 0; k < 3; ++k) at[k] = tried[k];
+            at[VALUE] = numbers[0];
+            at[SLOPE] = c * x - s * y;
+            at[SLOPE + 1] = s * x + c * y;
+            at[SLOPE + 2] = numbers[3];
+            at[MATRIX] = c * c * xx - 2 * c * s * xy + s * s * yy;
+            at[MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy;
+            at[MATRIX + 2] = c * xt - s * yt;
+            at[MATRIX + 3] = s * s * xx + 2 * c * s * xy + c * c * yy;
+            at[MATRIX + 4] = s * xt + c * yt;
+            at[MATRIX + 5] = numbers[12];
+        }
+        if (!first) {
+            const double damping = better ? at[DAMPING] / 5 : at[DAMPING] * 8;
+            at[DAMPING] = damping < 1e-6 ? 1e-6 : damping > 1e6 ? 1e6 : damping;
+            at[CALM] = off_x * off_x + off_y * off_y < small * small && turn < small;
+        }
+        at[STEPS] += 1;
+        at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
+        double step[3] = {0, 0, 0};
+        if (at[ENDED] == 0) damped_step(at, step);
+        for (int k = 0; k < 3; ++k) tried[k] = at[k] + step[k];
+        place_pose(own, poses, pose_cell, pose, pose_low, pose_status, frame, window);
     }
-    if (!first) {
-        const double damping = better ? at[DAMPING] / 5 : at[DAMPING] * 8;
-        at[DAMPING] = damping < 1e-6 ? 1e-6 : damping > 1e6 ? 1e6 : damping;
-        at[CALM] = off_x * off_x + off_y * off_y < small * small && turn < small;
-    }
-    at[STEPS] += 1;
-    at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
-    double step[3] = {0, 0, 0};
-    if (at[ENDED] == 0) damped_step(at, step);
-    for (int k = 0; k < 3 * parts; ++k) tried[k] = at[k % 3] + step[k % 3];
-    for (int part = parts * n; part < parts * (n + 1); ++part)
-        place_pose(part, poses, pose_cell, pose, pose_low, pose_status, frame, window);
+    if (own % parts == 0)
+        for (int k = 0; k < CLIMB; ++k) moved[CLIMB * n + k] = at[k];
 }

@@ -1,13 +1,15 @@
 // Exhaustive search over poses: sums of a table's cells over the end points of a scan; see the reference.
 // requires: score_cells
 
-// Points after which sums are compared, and points whose losses fit 15 bits.
+// Points after which sums are compared, points whose losses fit 15 bits, and points whose losses in units of at least as many
+// scores fit a byte.
 #if READ_AHEAD
 #define STEP 16
 #else
 #define STEP 48
 #endif
 #define TOGETHER 128
+#define FEW 4
 // Numbers that count the lines of a scan by their scores.
 #define BINS 512
 // The distance of a shift from the first one of its line: lines are rows on processors.
@@ -88,10 +90,11 @@ kernel void fold_quarters(ARGUMENTS) {
     quarters[image * lines * stride + place] = packed_losses(TOP - unit * loss, four);
 }
 
-// Return the scores of a block's quarters: score less the losses of points begin to end - 1. Once all are below least, the
-// other points are left out. The columns of a table lie across on GPUs, see fold_quarters.
+// Return the scores of a block's quarters: score less the losses of points begin to end - 1, apart from each other. Once all
+// are below least, the other points are left out. The columns of a table lie across on GPUs, see fold_quarters.
 int4 divided(global const int *quarters, global const int2 *point, global const int *image, const ScoreTable scores,
-             const int begin, const int end, const int row, const int col, const int score, const int least, const int across) {
+             const int begin, const int end, const int apart, const int row, const int col, const int score, const int least,
+             const int across) {
     const int lines = padded_lines(scores), stride = padded_stride(scores);
 #if READ_AHEAD
     const int down = across ? 1 : stride, right = across ? lines : 1;
@@ -100,13 +103,13 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
 #endif
     int4 total = (int4)(score);
     for (int k = begin; k < end;) {
-        const int stop = end - k > STEP ? k + STEP : end;
+        const int stop = end - k > STEP * apart ? k + STEP * apart : end;
         // Two sums of 16 bits in a number.
         int even = 0, odd = 0;
 #if READ_AHEAD
 #pragma unroll 8
 #endif
-        for (; k < stop; ++k) {
+        for (; k < stop; k += apart) {
             const int line = within(point[k].y + row + scores.margin, lines - 1);
             const int four = quarters[image[k] + line * down + within(point[k].x + col + scores.margin, stride - 1) * right];
             even += four & 0xff00ff;
@@ -118,6 +121,24 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
     return total;
 }
 
+#if IN_TEAMS
+// Work-items that share the points of a block.
+#define TEAM 32
+
+// Return the scores of a block's quarters from those that the members of a team have left of the block's score.
+int4 left_by_team(local int4 *shared, const int4 own, const int score) {
+    const int member = get_local_id(0);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    shared[member] = own - score;
+    for (int apart = TEAM / 2; apart > 0; apart /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (member < apart) shared[member] += shared[member + apart];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    return shared[0] + score;
+}
+#endif
+
 // Write the losses of each cell and the three below it as bytes of a number. One work-item takes a cell.
 kernel void pack_rows(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
@@ -128,26 +149,37 @@ kernel void pack_rows(ARGUMENTS) {
     packed[(image * lines + line) * stride + col] = (int)four;
 }
 
+// Add the losses of SHIFT_ROWS rows of a column, four of them as bytes of a number.
+void add_rows(uint *sums, global const int *table, const ScoreTable scores, const int row, const int col) {
+    global const int *cells = table + block_index(scores, row, col, SHIFT_ROWS - 1, 0);
+    for (int i = 0; i < SHIFT_ROWS / 4; ++i) sums[i] += cells[4 * i * padded_stride(scores)];
+}
+
 // Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
 // shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 kernel void shift_scores(ARGUMENTS) {
     const int col = get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
-    int some = 0;
-    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) some |= allowed[(row + i) * width + col];
-    const int stride = padded_stride(scores), last = some ? first[item + 1] : first[item];
+    int any = 0;
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) any |= allowed[(row + i) * width + col];
+    const int last = any ? first[item + 1] : first[item];
     int total[SHIFT_ROWS] = {0};
     for (int k = first[item]; k < last;) {
         const int stop = last - k > TOGETHER ? k + TOGETHER : last;
         // Two sums of 16 bits in a number.
         uint even[SHIFT_ROWS / 4] = {0}, odd[SHIFT_ROWS / 4] = {0};
-        for (; k < stop; ++k) {
-            global const int *cells =
-                table + image[k] + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
+        while (k < stop) {
+            const int few = unit >= FEW && stop - k >= FEW;
+            uint four[SHIFT_ROWS / 4] = {0};
+            if (few)
+                for (int j = k; j < k + FEW; ++j)
+                    add_rows(four, table + image[j], scores, point[j].y + row, point[j].x + col);
+            else
+                add_rows(four, table + image[k], scores, point[k].y + row, point[k].x + col);
+            k += few ? FEW : 1;
             for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
-                const uint four = cells[4 * i * stride];
-                even[i] += four & 0xff00ff;
-                odd[i] += four >> 8 & 0xff00ff;
+                even[i] += four[i] & 0xff00ff;
+                odd[i] += four[i] >> 8 & 0xff00ff;
             }
         }
         for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
@@ -271,14 +303,23 @@ kernel void choose_blocks(ARGUMENTS) {
 }
 
 // Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones; a block without
-// an allowed quarter has the score -1. Cells of the quarters are spacing apart for every 2^shift positions. One work-item takes a
-// block.
+// an allowed quarter has the score -1. Cells of the quarters are spacing apart for every 2^shift positions. One work-item,
+// or with IN_TEAMS a team of them, takes a block.
 kernel void follow_blocks(ARGUMENTS) {
-    const int n = get_global_id(0);
+#if IN_TEAMS
+    local int4 shared[TEAM];
+    const int n = get_group_id(0), member = get_local_id(0), members = TEAM;
+#else
+    const int n = get_global_id(0), member = 0, members = 1;
+#endif
     if (n >= blocks || block[4 * n + 3] < 0) return;
     const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
-    const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
-                              spacing * (col >> shift), block[4 * n + 3], -1, across);
+    int4 sums = divided(quarters, point, image, scores, first[item] + member, first[item + 1], members,
+                        spacing * (row >> shift), spacing * (col >> shift), block[4 * n + 3], -1, across);
+#if IN_TEAMS
+    sums = left_by_team(shared, sums, block[4 * n + 3]);
+#endif
+    if (member > 0) return;
     const int total[4] = {sums.x, sums.y, sums.z, sums.w};
     int most = -1;
     for (int i = 0; i < 4; ++i) {
@@ -294,15 +335,27 @@ kernel void follow_blocks(ARGUMENTS) {
 
 // Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level, and
 // collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which the caller
-// clears, may exceed room: then some are left out. Of workers work-items each takes run neighbouring blocks at a time.
+// clears, may exceed room: then some are left out. Of workers work-items each takes run neighbouring blocks at a time; with
+// IN_TEAMS a team shares a block where there are fewer blocks than work-items.
 kernel void divide_blocks(ARGUMENTS) {
     if (get_global_id(0) >= workers) return;
     const int left = count[level + 1] - begin, blocks = left < some ? left : some, quarter = 1 << level;
-    for (int n = run * get_global_id(0); n < blocks; n += n % run == run - 1 ? run * (workers - 1) + 1 : 1) {
+#if IN_TEAMS
+    local int4 shared[TEAM];
+    const int members = blocks < workers ? TEAM : 1, member = get_local_id(0) % members;
+#else
+    const int members = 1, member = 0;
+#endif
+    const int each = workers / members;
+    for (int n = run * (get_global_id(0) / members); n < blocks; n += n % run == run - 1 ? run * (each - 1) + 1 : 1) {
         global const int *here = block + 4 * (begin + n);
         const int item = here[0], row = here[1], col = here[2], least = low[item / turns];
-        const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
-                                  spacing * (col >> shift), here[3], least, across);
+        int4 sums = divided(quarters, point, image, scores, first[item] + member, first[item + 1], members,
+                            spacing * (row >> shift), spacing * (col >> shift), here[3], least, across);
+#if IN_TEAMS
+        if (members > 1) sums = left_by_team(shared, sums, here[3]);
+#endif
+        if (member > 0) continue;
         const int total[4] = {sums.x, sums.y, sums.z, sums.w};
         for (int i = 0; i < 4; ++i) {
             const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;

@@ -11,7 +11,8 @@ from .prelude import kernel
 # (2), damping, steps, whether the last step was small, and whether the climb has ended.
 VALUE, SLOPE, MATRIX, START = 3, 4, 7, 13
 DAMPING, STEPS, CALM, ENDED = 15, 16, 17, 18
-Numbers = wp.types.vector(length=13, dtype=wp.float64)
+Numbers = wp.types.vector(length=GRADIENT_NUMBERS, dtype=wp.float64)
+Climb = wp.types.vector(length=CLIMB, dtype=wp.float64)
 # Longest and largest step [m, rad], and the farthest that a climb leads from its start [m].
 LONGEST, LARGEST, FARTHEST_CLIMB = wp.float64(0.5), wp.float64(0.3), wp.float64(5.0)
 # Damping of a direction without information, relative to the largest information.
@@ -21,17 +22,16 @@ FIVE, EIGHT, MOST = (wp.float64(number) for number in (5.0, 8.0, 1e6))
 
 
 @wp.func
-def damped_step(climb: wp.array(dtype=wp.float64), at: wp.int32):
+def damped_step(climb: Climb):
     """Solve for the step that damping allows, of at most the longest length and turn."""
-    i = at + MATRIX
-    x, y, t = climb[at + SLOPE], climb[at + SLOPE + 1], climb[at + SLOPE + 2]
-    mean = HALF * (climb[i] + climb[i + 3])
-    damping = climb[at + DAMPING]
-    least = LEAST * (ONE + wp.max(mean, climb[i + 5]))
-    a = climb[i] + damping * mean + least
-    d = climb[i + 3] + damping * mean + least
-    f = climb[i + 5] + damping * climb[i + 5] + least
-    b, c, e = climb[i + 1], climb[i + 2], climb[i + 4]
+    x, y, t = climb[SLOPE], climb[SLOPE + 1], climb[SLOPE + 2]
+    mean = HALF * (climb[MATRIX] + climb[MATRIX + 3])
+    damping = climb[DAMPING]
+    least = LEAST * (ONE + wp.max(mean, climb[MATRIX + 5]))
+    a = climb[MATRIX] + damping * mean + least
+    d = climb[MATRIX + 3] + damping * mean + least
+    f = climb[MATRIX + 5] + damping * climb[MATRIX + 5] + least
+    b, c, e = climb[MATRIX + 1], climb[MATRIX + 2], climb[MATRIX + 4]
     xx = d * f - e * e
     xy = c * e - b * f
     xt = b * e - c * d
@@ -45,61 +45,65 @@ def damped_step(climb: wp.array(dtype=wp.float64), at: wp.int32):
 
 @kernel
 def climb_step(
-    gradient, poses, climb, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos, yaw_sin, frame,
-    window,
+    gradient, poses, climb, moved, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos, yaw_sin,
+    frame, window,
 ):  # fmt: skip
-    """Judge the poses that were evaluated, and take the next step of each climb."""
-    n = wp.tid()
+    """Judge the poses that were evaluated, and take the next step of each climb. A work-item takes a part of a scan."""
+    own = wp.tid()
+    n = own // parts
     if n >= scans:
         return
-    at = CLIMB * n
-    if climb[at + ENDED] != ZERO:
-        return
-    numbers = Numbers()
-    for part in range(parts):
-        for k in range(13):
-            numbers[k] = numbers[k] + wp.float64(gradient[GRADIENT_NUMBERS * (parts * n + part) + k])
-    tried = 3 * parts * n
-    off_x = poses[tried] - climb[at]
-    off_y = poses[tried + 1] - climb[at + 1]
-    turn = wp.abs(poses[tried + 2] - climb[at + 2])
-    far_x = poses[tried] - climb[at + START]
-    far_y = poses[tried + 1] - climb[at + START + 1]
-    first = climb[at + STEPS] < ZERO
-    within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB
-    better = first or (numbers[0] >= climb[at + VALUE] and within)
-    if better:
-        c = yaw_cos
-        s = yaw_sin
-        x, y = numbers[1], numbers[2]
-        xx, xy, xt = numbers[4], numbers[5], numbers[6]
-        yy, yt = numbers[8], numbers[9]
-        for k in range(3):
-            climb[at + k] = poses[tried + k]
-        climb[at + VALUE] = numbers[0]
-        climb[at + SLOPE] = c * x - s * y
-        climb[at + SLOPE + 1] = s * x + c * y
-        climb[at + SLOPE + 2] = numbers[3]
-        climb[at + MATRIX] = c * c * xx - TWO * c * s * xy + s * s * yy
-        climb[at + MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy
-        climb[at + MATRIX + 2] = c * xt - s * yt
-        climb[at + MATRIX + 3] = s * s * xx + TWO * c * s * xy + c * c * yy
-        climb[at + MATRIX + 4] = s * xt + c * yt
-        climb[at + MATRIX + 5] = numbers[12]
-    if not first:
-        damping = climb[at + DAMPING] * EIGHT
+    at = Climb()
+    for k in range(CLIMB):
+        at[k] = climb[CLIMB * n + k]
+    if at[ENDED] == ZERO:
+        numbers = Numbers()
+        for part in range(parts * n, parts * (n + 1)):
+            for k in range(GRADIENT_NUMBERS):
+                numbers[k] = numbers[k] + wp.float64(gradient[GRADIENT_NUMBERS * part + k])
+        tried = wp.vec3d(poses[3 * own], poses[3 * own + 1], poses[3 * own + 2])
+        off_x = tried.x - at[0]
+        off_y = tried.y - at[1]
+        turn = wp.abs(tried.z - at[2])
+        far_x = tried.x - at[START]
+        far_y = tried.y - at[START + 1]
+        first = at[STEPS] < ZERO
+        within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB
+        better = first or (numbers[0] >= at[VALUE] and within)
         if better:
-            damping = climb[at + DAMPING] / FIVE
-        climb[at + DAMPING] = wp.min(wp.max(damping, LEAST), MOST)
-        if off_x * off_x + off_y * off_y < small * small and turn < small:
-            climb[at + CALM] = ONE
-    climb[at + STEPS] = climb[at + STEPS] + ONE
-    step = wp.vec3d()
-    if climb[at + CALM] != ZERO or climb[at + STEPS] >= wp.float64(most):
-        climb[at + ENDED] = ONE
-    else:
-        step = damped_step(climb, at)
-    for part in range(parts):
+            c = yaw_cos
+            s = yaw_sin
+            x, y = numbers[1], numbers[2]
+            xx, xy, xt = numbers[4], numbers[5], numbers[6]
+            yy, yt = numbers[8], numbers[9]
+            for k in range(3):
+                at[k] = tried[k]
+            at[VALUE] = numbers[0]
+            at[SLOPE] = c * x - s * y
+            at[SLOPE + 1] = s * x + c * y
+            at[SLOPE + 2] = numbers[3]
+            at[MATRIX] = c * c * xx - TWO * c * s * xy + s * s * yy
+            at[MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy
+            at[MATRIX + 2] = c * xt - s * yt
+            at[MATRIX + 3] = s * s * xx + TWO * c * s * xy + c * c * yy
+            at[MATRIX + 4] = s * xt + c * yt
+            at[MATRIX + 5] = numbers[12]
+        if not first:
+            damping = at[DAMPING] * EIGHT
+            if better:
+                damping = at[DAMPING] / FIVE
+            at[DAMPING] = wp.min(wp.max(damping, LEAST), MOST)
+            if off_x * off_x + off_y * off_y < small * small and turn < small:
+                at[CALM] = ONE
+        at[STEPS] = at[STEPS] + ONE
+        step = wp.vec3d()
+        if at[CALM] != ZERO or at[STEPS] >= wp.float64(most):
+            at[ENDED] = ONE
+        else:
+            step = damped_step(at)
         for k in range(3):
-            poses[tried + 3 * part + k] = climb[at + k] + step[k]
-        place_pose(parts * n + part, poses, pose_cell, pose, pose_low, pose_status, frame, window)
+            poses[3 * own + k] = at[k] + step[k]
+        place_pose(own, poses, pose_cell, pose, pose_low, pose_status, frame, window)
+    if own % parts == 0:
+        for k in range(CLIMB):
+            moved[CLIMB * n + k] = at[k]

@@ -4,16 +4,19 @@ import warp as wp
 
 from gpusense.interface.constants import SHIFT_ROWS, TOP
 
-from .prelude import kernel, reader
+from .flags import IN_TEAMS
+from .prelude import kernel, on_gpu, reader, work_item
 from .score_cells import ScoreTable, block_index, padded_lines, padded_stride, within
 
 number_at, cell_at = reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
-# Points after which sums are compared, points that are read together, and points whose losses fit 15 bits.
+# Points after which sums are compared, points that are read together, points whose losses fit 15 bits, and points whose
+# losses in units of at least as many scores fit a byte.
 STEP = 16
 AT_ONCE = 8
 TOGETHER = 128
+FEW = 4
 # Numbers that count the lines of a scan by their scores.
 BINS = 512
 
@@ -120,10 +123,10 @@ def fold_quarters(table, bound, quarters, scores, bounds, folded, period, step, 
 @wp.func
 def divided(
     quarters: wp.array(dtype=wp.int32), point: wp.array(dtype=wp.vec2i), image: wp.array(dtype=wp.int32),
-    scores: ScoreTable, begin: wp.int32, end: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32, least: wp.int32,
-    across: wp.int32,
+    scores: ScoreTable, begin: wp.int32, end: wp.int32, apart: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32,
+    least: wp.int32, across: wp.int32,
 ):  # fmt: skip
-    """Return the scores of a block's quarters: score less the losses of points begin to end - 1."""
+    """Return the scores of a block's quarters: score less the losses of points begin to end - 1, apart from others."""
     lines = padded_lines(scores)
     stride = padded_stride(scores)
     down = int(stride)
@@ -134,26 +137,52 @@ def divided(
     total = wp.vec4i(score, score, score, score)
     k = int(begin)
     while k < end:
-        stop = wp.min(k + STEP, end)
+        stop = wp.min(k + STEP * apart, end)
         # Two sums of 16 bits in a number.
         even = int(0)
         odd = int(0)
         while k < stop:
             for i in range(AT_ONCE):
-                n = wp.min(k + i, stop - 1)
+                n = wp.min(k + i * apart, stop - 1)
                 cell = cell_at(point, n)
                 line = within(cell.y + row + scores.margin, lines - 1)
                 aside = within(cell.x + col + scores.margin, stride - 1)
                 four = number_at(quarters, number_at(image, n) + line * down + aside * right)
-                if k + i >= stop:
+                if k + i * apart >= stop:
                     four = int(0)
                 even = even + (four & 0xFF00FF)
                 odd = odd + ((four >> 8) & 0xFF00FF)
-            k = k + AT_ONCE
+            k = k + AT_ONCE * apart
         total = total - wp.vec4i(even & 0xFFFF, odd & 0xFFFF, even >> 16, odd >> 16)
         if wp.max(total) < least:
             k = end
     return total
+
+
+# With IN_TEAMS the work-items of a group, which is a warp, share a block; on processors the first member takes all points.
+TEAM = 1
+
+
+if IN_TEAMS:
+    TEAM = 32
+_LEFT_BY_TEAM = """
+#if defined(__CUDA_ARCH__)
+wp::vec_t<4, int> left = own;
+for (int i = 0; i < 4; ++i) {
+    int total = own.c[i] - score;
+    for (int apart = 16; apart > 0; apart /= 2) total += __shfl_xor_sync(0xffffffff, total, apart);
+    left.c[i] = score + total;
+}
+return left;
+#else
+return own;
+#endif
+"""
+
+
+# Return the scores of a block's quarters from those that the members of a team have left of the block's score.
+@wp.func_native(_LEFT_BY_TEAM)
+def left_by_team(own: wp.vec4i, score: wp.int32) -> wp.vec4i: ...
 
 
 @kernel
@@ -170,6 +199,15 @@ def pack_rows(table, packed, scores):
     packed[(image * lines + line) * stride + col] = four
 
 
+@wp.func
+def add_rows(
+    sums: wp.vec2i, table: wp.array(dtype=wp.int32), image: wp.int32, scores: ScoreTable, row: wp.int32, col: wp.int32
+):  # fmt: skip
+    """Add the losses of SHIFT_ROWS rows of a column, four of them as bytes of a number."""
+    place = image + block_index(scores, row, col, SHIFT_ROWS - 1, 0)
+    return sums + wp.vec2i(number_at(table, place), number_at(table, place + 4 * padded_stride(scores)))
+
+
 @kernel
 def shift_scores(table, point, image, first, allowed, score, scores, items, height, width, unit):
     """Sum the losses of each item's points at all shifts, and write the scores; -1 where not allowed."""
@@ -177,12 +215,11 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
     row = SHIFT_ROWS * block
     if col >= width or row >= height or item >= items:
         return
-    some = int(0)
+    any = int(0)
     for i in range(wp.min(SHIFT_ROWS, height - row)):
-        some = some + int(allowed[(row + i) * width + col])
-    stride = padded_stride(scores)
+        any = any + int(allowed[(row + i) * width + col])
     last = first[item]
-    if some > 0:
+    if any > 0:
         last = first[item + 1]
     total = Rows()
     k = int(first[item])
@@ -192,13 +229,19 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
         even = wp.vec2i()
         odd = wp.vec2i()
         while k < stop:
-            cell = cell_at(point, k)
-            place = number_at(image, k) + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
+            four = wp.vec2i()
+            if unit >= FEW and stop - k >= FEW:
+                for j in range(FEW):
+                    cell = cell_at(point, k + j)
+                    four = add_rows(four, table, number_at(image, k + j), scores, cell.y + row, cell.x + col)
+                k = k + FEW
+            else:
+                cell = cell_at(point, k)
+                four = add_rows(four, table, number_at(image, k), scores, cell.y + row, cell.x + col)
+                k = k + 1
             for i in range(2):
-                four = number_at(table, place + 4 * i * stride)
-                even[i] = even[i] + (four & 0xFF00FF)
-                odd[i] = odd[i] + ((four >> 8) & 0xFF00FF)
-            k = k + 1
+                even[i] = even[i] + (four[i] & 0xFF00FF)
+                odd[i] = odd[i] + ((four[i] >> 8) & 0xFF00FF)
         for i in range(2):
             total[4 * i] = total[4 * i] + (even[i] & 0xFFFF)
             total[4 * i + 1] = total[4 * i + 1] + (odd[i] & 0xFFFF)
@@ -339,8 +382,13 @@ def follow_blocks(
     across,
 ):  # fmt: skip
     """Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones."""
-    n = wp.tid()
-    if n >= blocks:
+    own = work_item(wp.tid())
+    n = own // TEAM
+    member = own % TEAM
+    members = int(1)
+    if IN_TEAMS and on_gpu():
+        members = TEAM
+    if n >= blocks or member >= members:
         return
     score = block[4 * n + 3]
     if score < 0:
@@ -349,9 +397,13 @@ def follow_blocks(
     row = block[4 * n + 1]
     col = block[4 * n + 2]
     total = divided(
-        quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
+        quarters, point, image, scores, first[item] + member, first[item + 1], members, spacing * (row >> shift),
         spacing * (col >> shift), score, -1, across,
     )  # fmt: skip
+    if IN_TEAMS:
+        total = left_by_team(total, score)
+    if member > 0:
+        return
     most = int(-1)
     for i in range(4):
         part_row = row + ((i // 2) << level)
@@ -370,9 +422,14 @@ def divide_blocks(
     width, columns, turns, level, spacing, shift, across,
 ):  # fmt: skip
     """Divide blocks of positions into quarters, and collect those whose scores may be high enough."""
-    worker = wp.tid()
+    own = work_item(wp.tid())
     blocks = wp.min(count[level + 1] - begin, some)
-    n = run * worker
+    members = int(1)
+    if IN_TEAMS and on_gpu() and blocks < workers:
+        members = TEAM
+    member = own % members
+    each = workers // members
+    n = run * (own // members)
     while n < blocks:
         here = 4 * (begin + n)
         item = block[here]
@@ -380,20 +437,24 @@ def divide_blocks(
         col = block[here + 2]
         least = low[item // turns]
         total = divided(
-            quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
+            quarters, point, image, scores, first[item] + member, first[item + 1], members, spacing * (row >> shift),
             spacing * (col >> shift), block[here + 3], least, across,
         )  # fmt: skip
-        for i in range(4):
-            part_row = row + ((i // 2) << level)
-            part_col = col + ((i % 2) << level)
-            if part_row < height and part_col < width and total[i] >= least:
-                if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
-                    m = wp.atomic_add(count, level, 1)
-                    if m < room:
-                        part[4 * m] = item
-                        part[4 * m + 1] = part_row
-                        part[4 * m + 2] = part_col
-                        part[4 * m + 3] = total[i]
+        if IN_TEAMS:
+            if members > 1:
+                total = left_by_team(total, block[here + 3])
+        if member == 0:
+            for i in range(4):
+                part_row = row + ((i // 2) << level)
+                part_col = col + ((i % 2) << level)
+                if part_row < height and part_col < width and total[i] >= least:
+                    if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
+                        m = wp.atomic_add(count, level, 1)
+                        if m < room:
+                            part[4 * m] = item
+                            part[4 * m + 1] = part_row
+                            part[4 * m + 2] = part_col
+                            part[4 * m + 3] = total[i]
         if n % run == run - 1:
-            n = n + run * (workers - 1)
+            n = n + run * (each - 1)
         n = n + 1

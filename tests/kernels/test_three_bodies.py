@@ -135,6 +135,7 @@ ON_PURPOSE = [
     Purpose("score_cells", "block_index", KERNELS_ONLY, "the reference clamps each cell by itself"),
     Purpose("score_cells", "cell_index", REFERENCE_ONLY, ARRAYS),
     Purpose("search", "_quarters_of", REFERENCE_ONLY, ARRAYS),
+    Purpose("search", "add_rows left_by_team", KERNELS_ONLY, "the reference sums exact numbers, without teams"),
     Purpose("search_ends", "periods", KERNELS_ONLY, "NumPy's division of integers rounds down"),
     Purpose("search_ends", "cell_of", (OPENCL,), FLOOR),
     Purpose("segments", "add_row", KERNELS_ONLY, "points come one after another, added by rotations"),

@@ -47,8 +47,8 @@ KERNELS: dict[str, Kernel] = {
         "Score score", "ScanBatch batch if SCANS", in_lanes=True,
     ),
     "climb_step": kernel(
-        "field_climb", "scan", f"real gradient [{GRADIENT_NUMBERS} * parts * scans]",
-        "out double poses [3 * parts * scans]", f"out double climb [{CLIMB} * scans]",
+        "field_climb", "part", f"real gradient [{GRADIENT_NUMBERS} * parts * scans]",
+        "out double poses [3 * parts * scans]", f"double climb [{CLIMB} * scans]", f"out double moved [{CLIMB} * scans]",
         "out int2 pose_cell [parts * scans]", "out real4 pose [parts * scans]", "out real4 pose_low [parts * scans]",
         "out int pose_status [2]", "int scans", "int parts", "int most", "double small", "double yaw_cos",
         "double yaw_sin", "Frame frame", WINDOW,
@@ -129,13 +129,13 @@ KERNELS: dict[str, Kernel] = {
     "follow_blocks": kernel(
         "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "out int block [4 * blocks]",
         "ScoreTable scores", "int blocks", "int height", "int width", "int columns", "int level", "int spacing",
-        "int shift", "int across",
+        "int shift", "int across", team=32,
     ),
     "divide_blocks": kernel(
         "search", "worker", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * (begin + some)]",
         "int low [scans]", "out int part [4 * room]", "out int count [levels]", "ScoreTable scores", "int begin",
         "int some", "int room", "int workers", "int run", "int height", "int width", "int columns", "int turns",
-        "int level", "int spacing", "int shift", "int across",
+        "int level", "int spacing", "int shift", "int across", team=32,
     ),
     "split_scans": kernel(
         "segments", "scan", *_NOISY, "out real cost [points]", "out int stop [points]", "int scans", "int points",

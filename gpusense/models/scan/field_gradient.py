@@ -29,13 +29,13 @@ from gpusense.reference.field_climb import CALM, DAMPING, ENDED, START, STEPS
 
 # Flags of the mixture that have no meaning for the kernel.
 _OTHERS = {"LOG_TABLE", "CUBES"}
-# Steps of a climb at most, how far a climb leads from its start, and a little more [m], and steps between two reads by
-# kind of device.
-_MOST_STEPS, _FARTHEST, _STEPS_AT_ONCE = 50, 5.5, {"gpu": 6, "cpu": 4}
+# Steps of a climb at most, how far a climb leads from its start, and a little more [m], and pairs of steps between two
+# reads by kind of device.
+_MOST_STEPS, _FARTHEST, _PAIRS_AT_ONCE = 50, 5.5, {"gpu": 3, "cpu": 2}
 # Length and turn of a step that end a climb [m, rad], by the bytes of a number.
 _SMALL = {4: 3e-4, 8: 1e-4}
 # Parts of a scan in a climb, by kind of device.
-_PARTS = {"gpu": 16, "cpu": 1}
+_PARTS = {"gpu": 64, "cpu": 1}
 
 
 class Gradients:
@@ -141,14 +141,16 @@ class Climbs(Gradients):
         arguments = placed.arguments()
         del arguments["particles"]
         if backend.info.float64:
-            there = space.upload("climb", end)
-            step = launch(
-                "climb_step", flags | placed.flags, (count,), gradient=gradient, climb=there, **numbers, **arguments
-            )  # fmt: skip
-            climb = ChangingProgram(backend, (program[-1], step), ())
+            there, moved = space.upload("climb", end), space.empty("climb moved", end.size, end.dtype)
+            steps = [
+                launch("climb_step", flags | placed.flags, (parts * count,), gradient=gradient, climb=before, moved=after,
+                       **numbers, **arguments)
+                for before, after in ((there, moved), (moved, there))
+            ]  # fmt: skip
+            climb = ChangingProgram(backend, (program[-1], steps[0], program[-1], steps[1]), ())
             backend.run(program[:-1])
             while not end[:, ENDED].all():
-                for _ in range(_STEPS_AT_ONCE[backend.info.kind]):
+                for _ in range(_PAIRS_AT_ONCE[backend.info.kind]):
                     climb({})
                 space.read(there, end)
             return
@@ -159,7 +161,7 @@ class Climbs(Gradients):
             backend.run(program)
             space.read(gradient, rows)
             climb_step(
-                (count,), rows.reshape(-1), pose.reshape(-1), end.reshape(-1), *room, *numbers.values(),
+                (count,), rows.reshape(-1), pose.reshape(-1), *(end.reshape(-1),) * 2, *room, *numbers.values(),
                 arguments["frame"], arguments["window"],
             )  # fmt: skip
             program = self._placed(pose, readings)[0]

@@ -55,8 +55,8 @@ RUN, SHIFT_ROWS, TOP = 32, 8, 255
 MATCH_RESULT, MATCH_RULES = 35, 14
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
 GRADIENT_NUMBERS = 13
-# Kernel file field_climb: numbers of a climb.
-CLIMB = 19
+# Kernel file field_climb: numbers of a climb, and of a pose's log p, gradient and half of its information.
+CLIMB, CLIMB_SUMS = 19, 10
 # Kernel files segments and circles: numbers of a line and of a circle.
 LINE_NUMBERS, CIRCLE_NUMBERS = 6, 10
 
@@ -114,7 +114,7 @@ _NAMES = {
     "end_point": "FIELD_RING",
     "error_free": "BLOCK_TERMS STRANDS",
     "estimate": "ESTIMATE_SUMS ESTIMATE_LANES FAR FAR_TURN WIDE_HEADINGS FAR_SHARE",
-    "field_climb": "CLIMB GRADIENT_NUMBERS",
+    "field_climb": "CLIMB CLIMB_SUMS",
     "field_gradient": "GRADIENT_NUMBERS",
     "elementary": "ROUNDER QUARTER HALF_TURN LOG2_HIGH LOG2_LOW INVERSE_LOG2 LEAST_EXPONENT SQRT_HALF EXP ODD",
     "heading": """LARGEST_HEADING ROUNDER QUARTER QUARTER_LOW TWO_OVER_PI QUARTER_1 QUARTER_2 QUARTER_3 QUARTER_4 S C

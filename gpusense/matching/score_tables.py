@@ -15,8 +15,8 @@ from gpusense.interface.structs import ScoreTable
 
 _BYTE, _INT = np.dtype(np.uint8), np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Levels between the blocks of a level and the steps of their first cells, by kind of device: processors need few images in
-# their caches, one level less for tables of more cells.
+# Levels between the blocks of a level and the steps of their first cells, by kind of device: processors need few images
+# in their caches, one level less for tables of more cells.
 _STEP, _FEW_CELLS = {"cpu": 3, "gpu": 8}, 1 << 20
 # Scores in a unit of the losses of folded tables, so that the losses of several points fit a byte.
 _UNIT = 4

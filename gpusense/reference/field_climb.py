@@ -1,4 +1,4 @@
-"""Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field.
+"""Damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field.
 
 Damping and the stopping rule are the same in all directions, so that ends turn with the map.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS
+from gpusense.interface.structs import ScanBatch
+from gpusense.reference.field_gradient import field_gradient
 from gpusense.reference.placement import place_pose
 
 # Places of a climb's numbers: the best pose (3), its log-likelihood, gradient (3) and information (6), the start (2),
@@ -33,15 +35,14 @@ def damped_step(climb: np.ndarray) -> np.ndarray:
 
 
 def climb_step(
-    flags, gradient, poses, climb, moved, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos,
-    yaw_sin, frame, window,
-):  # fmt: skip
-    """Judge the poses that were evaluated, numbers in the grid's frame, and take and place each climb's next step."""
-    everyone, tried = moved[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
-    everyone[...] = climb[: CLIMB * scans].reshape(scans, CLIMB)
-    rows = np.flatnonzero(everyone[:, ENDED] == 0)
-    at, trial = everyone[rows], tried[rows, 0]
-    numbers = gradient[: GRADIENT_NUMBERS * parts * scans].reshape(scans, parts, -1)[rows].sum(axis=1, dtype=np.float64)
+    climb: np.ndarray, tried: np.ndarray, numbers: np.ndarray, most: int, small: float, yaw_cos: float, yaw_sin: float
+) -> None:
+    """Judge the poses (S, 3) that were tried by their numbers (S, 13) in the grid's frame, and write the next ones.
+
+    Poses of climbs (S, 19) that have ended stay.
+    """
+    rows = np.flatnonzero(climb[:, ENDED] == 0)
+    at, trial, numbers = climb[rows], tried[rows], numbers[rows].astype(np.float64)
     off, far = trial - at[:, :3], trial[:, :2] - at[:, START : START + 2]
     first = at[:, STEPS] < 0
     better = first | ((numbers[:, 0] >= at[:, VALUE]) & (np.hypot(*far.T) <= _FARTHEST))
@@ -54,8 +55,21 @@ def climb_step(
     at[:, CALM] = ~first & (np.maximum(np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])) < small)
     at[:, STEPS] += 1
     at[:, ENDED] = (at[:, CALM] != 0) | (at[:, STEPS] >= most)
-    tried[rows] = (at[:, :3] + np.where(at[:, ENDED, None] != 0, 0, damped_step(at)))[:, None]
-    everyone[rows] = at
-    for n in rows:
-        part = slice(parts * n, parts * (n + 1))
-        place_pose(flags, tried[n], pose_cell[part], pose[part], pose_low[part], pose_status, frame, window)
+    tried[rows] = at[:, :3] + np.where(at[:, ENDED, None] != 0, 0, damped_step(at))
+    climb[rows] = at
+
+
+def climb_field(
+    flags, table, poses, climb, pose_cell, pose, pose_low, pose_status, point, point_low, terms, start, constant_terms,
+    scans, readings, guard, mount_x, mount_y, resolution, score, most, small, yaw_cos, yaw_sin, frame, window,
+):  # fmt: skip
+    """Climb from placed poses, one a scan, and write the ends."""
+    climbs, tried = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * scans].reshape(scans, 3)
+    numbers = np.empty((scans, GRADIENT_NUMBERS), table.dtype)
+    while not climbs[:, ENDED].all():
+        field_gradient(
+            flags, table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms,
+            numbers.reshape(-1), window, scans, readings, guard, mount_x, mount_y, resolution, score, ScanBatch(1, 0),
+        )  # fmt: skip
+        climb_step(climbs, tried, numbers, most, small, yaw_cos, yaw_sin)
+        place_pose(flags, tried, pose_cell[:scans], pose[:scans], pose_low[:scans], pose_status, frame, window)

@@ -1,6 +1,6 @@
-// Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field. Damping and the
-// stopping rule are the same in all directions, so that ends turn with the map.
-// requires: placement
+// Damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field. Damping and the stopping rule are
+// the same in all directions, so that ends turn with the map.
+// requires: field_gradient placement
 
 // Numbers of a climb: the best pose (3), its log-likelihood, gradient (3) and information (6), the pose to start from (2),
 // damping, steps, whether the last step was small, and whether the climb has ended.
@@ -36,50 +36,106 @@ void damped_step(const double *climb, double *step) {
     for (int k = 0; k < 3; ++k) step[k] = over > 1 ? step[k] / over : step[k];
 }
 
-// Judge the poses that were evaluated, and take the next step of each climb. Each scan has parts neighbouring poses, all
-// equal, whose numbers in the grid's frame are added. The next poses are placed as place_poses does. Poses of climbs that
-// have ended stay. One work-item takes a part of a scan; the first part writes the climb.
-kernel void climb_step(ARGUMENTS) {
-    const int own = get_global_id(0), n = own / parts;
-    if (n >= scans) return;
-    double at[CLIMB];
-    for (int k = 0; k < CLIMB; ++k) at[k] = climb[CLIMB * n + k];
-    if (at[ENDED] == 0) {
-        global double *tried = poses + 3 * own;
-        double numbers[GRADIENT_NUMBERS] = {0};
-        for (int part = parts * n; part < parts * (n + 1); ++part)
-            for (int k = 0; k < GRADIENT_NUMBERS; ++k) numbers[k] += gradient[GRADIENT_NUMBERS * part + k];
-        const double off_x = tried[0] - at[0], off_y = tried[1] - at[1], turn = fabs(tried[2] - at[2]);
-        const double far_x = tried[0] - at[START], far_y = tried[1] - at[START + 1];
-        const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
-        const bool better = first || (numbers[0] >= at[VALUE] && within);
-        if (better) {
-            const double c = yaw_cos, s = yaw_sin, x = numbers[1], y = numbers[2];
-            const double xx = numbers[4], xy = numbers[5], yy = numbers[8], xt = numbers[6], yt = numbers[9];
-            for (int k = 0; k < 3; ++k) at[k] = tried[k];
-            at[VALUE] = numbers[0];
-            at[SLOPE] = c * x - s * y;
-            at[SLOPE + 1] = s * x + c * y;
-            at[SLOPE + 2] = numbers[3];
-            at[MATRIX] = c * c * xx - 2 * c * s * xy + s * s * yy;
-            at[MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy;
-            at[MATRIX + 2] = c * xt - s * yt;
-            at[MATRIX + 3] = s * s * xx + 2 * c * s * xy + c * c * yy;
-            at[MATRIX + 4] = s * xt + c * yt;
-            at[MATRIX + 5] = numbers[12];
-        }
-        if (!first) {
-            const double damping = better ? at[DAMPING] / 5 : at[DAMPING] * 8;
-            at[DAMPING] = damping < 1e-6 ? 1e-6 : damping > 1e6 ? 1e6 : damping;
-            at[CALM] = off_x * off_x + off_y * off_y < small * small && turn < small;
-        }
-        at[STEPS] += 1;
-        at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
-        double step[3] = {0, 0, 0};
-        if (at[ENDED] == 0) damped_step(at, step);
-        for (int k = 0; k < 3; ++k) tried[k] = at[k] + step[k];
-        place_pose(own, poses, pose_cell, pose, pose_low, pose_status, frame, window);
+// Judge the pose that was tried, and replace it by the next one. Numbers are in the grid's frame: log p, gradient (3), and
+// the upper half of the information by rows.
+void climb_step(double *at, double *tried, const double *numbers, const int most, const double small, const double yaw_cos,
+                const double yaw_sin) {
+    const double off_x = tried[0] - at[0], off_y = tried[1] - at[1], turn = fabs(tried[2] - at[2]);
+    const double far_x = tried[0] - at[START], far_y = tried[1] - at[START + 1];
+    const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
+    const bool better = first || (numbers[0] >= at[VALUE] && within);
+    if (better) {
+        const double c = yaw_cos, s = yaw_sin, x = numbers[1], y = numbers[2];
+        const double xx = numbers[4], xy = numbers[5], xt = numbers[6], yy = numbers[7], yt = numbers[8];
+        for (int k = 0; k < 3; ++k) at[k] = tried[k];
+        at[VALUE] = numbers[0];
+        at[SLOPE] = c * x - s * y;
+        at[SLOPE + 1] = s * x + c * y;
+        at[SLOPE + 2] = numbers[3];
+        at[MATRIX] = c * c * xx - 2 * c * s * xy + s * s * yy;
+        at[MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy;
+        at[MATRIX + 2] = c * xt - s * yt;
+        at[MATRIX + 3] = s * s * xx + 2 * c * s * xy + c * c * yy;
+        at[MATRIX + 4] = s * xt + c * yt;
+        at[MATRIX + 5] = numbers[9];
     }
-    if (own % parts == 0)
-        for (int k = 0; k < CLIMB; ++k) moved[CLIMB * n + k] = at[k];
+    if (!first) {
+        const double damping = better ? at[DAMPING] / 5 : at[DAMPING] * 8;
+        at[DAMPING] = damping < 1e-6 ? 1e-6 : damping > 1e6 ? 1e6 : damping;
+        at[CALM] = off_x * off_x + off_y * off_y < small * small && turn < small;
+    }
+    at[STEPS] += 1;
+    at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
+    double step[3] = {0, 0, 0};
+    if (at[ENDED] == 0) damped_step(at, step);
+    for (int k = 0; k < 3; ++k) tried[k] = at[k] + step[k];
+}
+
+// With IN_TEAMS the work-items of a group share the readings of a scan, each with the same climb.
+#if IN_TEAMS
+#if SMALL_TEAMS
+#define TEAM 32
+#else
+#define TEAM 256
+#endif
+
+// Replace numbers by their sums over the team.
+void add_over_members(double *numbers, local double *shared) {
+    local double *mine = shared + get_local_id(0);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int i = 0; i < CLIMB_SUMS; ++i) mine[TEAM * i] = numbers[i];
+    for (int apart = TEAM / 2; apart > 0; apart /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (get_local_id(0) >= apart) continue;
+        for (int i = 0; i < CLIMB_SUMS; ++i) mine[TEAM * i] += mine[TEAM * i + apart];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int i = 0; i < CLIMB_SUMS; ++i) numbers[i] = shared[TEAM * i];
+}
+#endif
+
+// Climb from placed poses, one a scan, and write the ends. One work-item, or with IN_TEAMS a team of them, takes a scan.
+kernel void climb_field(ARGUMENTS) {
+#if IN_TEAMS
+    local double shared[CLIMB_SUMS * TEAM];
+    const int n = get_group_id(0), member = get_local_id(0), members = TEAM;
+#else
+    const int n = get_global_id(0), member = 0, members = 1;
+#endif
+    if (n >= scans) return;
+#if SCANS
+    const int first = start[n], size = start[n + 1];
+    const real constant_term = constant_terms[n];
+#else
+    const int first = 0, size = readings;
+    const real constant_term = score.constant_term;
+#endif
+    double at[CLIMB], tried[3];
+    for (int k = 0; k < CLIMB; ++k) at[k] = climb[CLIMB * n + k];
+    for (int k = 0; k < 3; ++k) tried[k] = poses[3 * n + k];
+    while (at[ENDED] == 0) {
+#if TWO_PART_POINTS
+        const real4 low = pose_low[n];
+#else
+        const real4 low = (real4)(0);
+#endif
+        real sums[CLIMB_SUMS - 1];
+        for (int i = 0; i < CLIMB_SUMS - 1; ++i) sums[i] = 0;
+        // The first member has the constant term.
+        const real2 own = add_readings((real2)(member > 0 ? 0 : constant_term, 0), sums, table, pose_cell[n], pose[n], low,
+                                       point, point_low, terms, first + member, size, members, window, guard,
+                                       (real2)(mount_x, mount_y), resolution);
+        double numbers[CLIMB_SUMS];
+        numbers[0] = scaled_sum(own, score.temperature);
+        for (int i = 1; i < CLIMB_SUMS; ++i) numbers[i] = score.temperature * sums[i - 1];
+#if IN_TEAMS
+        add_over_members(numbers, shared);
+#endif
+        climb_step(at, tried, numbers, most, small, yaw_cos, yaw_sin);
+        // All members write the same numbers.
+        for (int k = 0; k < 3; ++k) poses[3 * n + k] = tried[k];
+        place_pose(n, poses, pose_cell, pose, pose_low, pose_status, frame, window);
+    }
+    if (member > 0) return;
+    for (int k = 0; k < CLIMB; ++k) climb[CLIMB * n + k] = at[k];
 }

@@ -44,31 +44,14 @@ void add_slope(real *sums, const real4 slope, const real weight, const real4 at,
     sums[8] += weight * turn * turn;
 }
 
-// Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature. One
-// work-item takes a particle. mount is the sensor's place on the robot in cells.
-kernel void field_gradient(ARGUMENTS) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-#if SCANS
-    const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
-    const real constant_term = constant_terms[scan];
-    point += start[scan];
-    point_low += start[scan];
-#else
-    const int size = readings;
-    const real constant_term = score.constant_term;
-#endif
-    const int2 origin = pose_cell[n];
-    const real4 at = pose[n];
-#if TWO_PART_POINTS
-    const real4 low = pose_low[n];
-#else
-    const real4 low = (real4)(0);
-#endif
-    real2 total = (real2)(constant_term, 0);
-    real sums[9];
-    for (int i = 0; i < 9; ++i) sums[i] = 0;
-    for (int k = 0; k < size; ++k) {
+// Add the readings of a scan from one on, apart from each other, to log p and to the sums of add_slope. mount is the sensor's
+// place on the robot in cells.
+real2 add_readings(const real2 before, real *sums, global const real *table, const int2 origin, const real4 at, const real4 low,
+                   global const real2 *point, global const real2 *point_low, global const FieldTerms *terms, const int first,
+                   const int size, const int apart, const Window window, const real guard, const real2 mount,
+                   const real resolution) {
+    real2 total = before;
+    for (int k = first; k < size; k += apart) {
         const real2 to = point[k];
 #if ALL_READINGS
         if (!isfinite(to.x)) {
@@ -82,8 +65,34 @@ kernel void field_gradient(ARGUMENTS) {
         total = add_term(total, log_field(distance, terms));
         const real bend = shape_weight(field_square(distance, terms).x, terms->shape_power, terms->shape_rate);
         const real weight = 2 * terms->square_scale * hit_share(distance, terms) * bend;
-        add_slope(sums, slope, weight, at, to + (real2)(mount_x, mount_y), resolution);
+        add_slope(sums, slope, weight, at, to + mount, resolution);
     }
+    return total;
+}
+
+// Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature. One
+// work-item takes a particle.
+kernel void field_gradient(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+#if SCANS
+    const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
+    const real constant_term = constant_terms[scan];
+    point += start[scan];
+    point_low += start[scan];
+#else
+    const int size = readings;
+    const real constant_term = score.constant_term;
+#endif
+#if TWO_PART_POINTS
+    const real4 low = pose_low[n];
+#else
+    const real4 low = (real4)(0);
+#endif
+    real sums[9];
+    for (int i = 0; i < 9; ++i) sums[i] = 0;
+    const real2 total = add_readings((real2)(constant_term, 0), sums, table, pose_cell[n], pose[n], low, point, point_low,
+                                     terms, 0, size, 1, window, guard, (real2)(mount_x, mount_y), resolution);
     global real *out = gradient + (long)GRADIENT_NUMBERS * n;
     out[0] = scaled_sum(total, score.temperature);
     for (int i = 0; i < 6; ++i) out[1 + i] = score.temperature * sums[i];

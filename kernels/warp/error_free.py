@@ -83,6 +83,12 @@ def add_term(total: vec2, term: real):
 
 
 @wp.func
+def scaled_sum(total: vec2, factor: real):
+    """Return a factor times a sum in two parts, or the sum if it is infinite."""
+    return wp.where(wp.isinf(total.x), total.x, factor * (total.x + total.y))
+
+
+@wp.func
 def add_strands(total: vec2, strands: vec4):
     """Add a block to a compensated sum, by its strands."""
     return add_term(add_term(add_term(add_term(total, strands[0]), strands[1]), strands[2]), strands[3])

@@ -5,7 +5,7 @@ import warp as wp
 from gpusense.interface.constants import GRADIENT_NUMBERS
 
 from .end_point import EndPoint, end_point, field_cell
-from .error_free import add_term
+from .error_free import add_term, scaled_sum
 from .field_term import bilinear, field_exponent, field_square, log_field
 from .flags import ALL_READINGS, HIT, LINEAR, SCANS, TWO_PART_POINTS
 from .hit_shape import shape_weight
@@ -73,6 +73,38 @@ def add_slope(before: Sums, slope: vec4, weight: real, at: vec4, arm: vec2, reso
     return sums
 
 
+@wp.func
+def add_readings(
+    before: vec2, begun: Sums, table: wp.array(dtype=real), origin: wp.vec2i, at: vec4, low: vec4,
+    point: wp.array(dtype=vec2), point_low: wp.array(dtype=vec2), terms: wp.array(dtype=FieldTerms), first: wp.int32,
+    end_of_scan: wp.int32, apart: wp.int32, window: Window, guard: real, mount: vec2, resolution: real,
+):  # fmt: skip
+    """Return log p and the sums of add_slope with the readings of a scan from one on, apart from each other."""
+    total = before
+    sums = begun
+    k = int(first)
+    while k < end_of_scan:
+        to = point[k]
+        used = bool(True)
+        if ALL_READINGS:
+            used = wp.isfinite(to.x)
+            if wp.isinf(to.x):
+                total = add_term(total, terms[0].z_max)
+        if used:
+            to_low = vec2()
+            if TWO_PART_POINTS:
+                to_low = point_low[k]
+            end = end_point(at, low, to, to_low, HALF, guard)
+            slope = distance_slope(table, origin + end.cell, end, window)
+            distance = vec2(slope.x, slope.y)
+            total = add_term(total, log_field(distance, terms))
+            bend = shape_weight(field_square(distance, terms).x, terms[0].shape_power, terms[0].shape_rate)
+            weight = TWO * terms[0].square_scale * hit_share(distance, terms) * bend
+            sums = add_slope(sums, slope, weight, at, to + mount, resolution)
+        k += apart
+    return total, sums
+
+
 @kernel
 def field_gradient(
     table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, gradient, window, particles,
@@ -90,38 +122,15 @@ def field_gradient(
         begin = start[scan]
         size = start[scan + 1] - begin
         constant_term = constant_terms[scan]
-    origin = pose_cell[n]
-    at = pose[n]
     low = vec4()
     if TWO_PART_POINTS:
         low = pose_low[n]
-    total = vec2(constant_term, ZERO)
-    sums = Sums()
-    k = int(0)
-    while k < size:
-        to = point[begin + k]
-        used = bool(True)
-        if ALL_READINGS:
-            used = wp.isfinite(to.x)
-            if wp.isinf(to.x):
-                total = add_term(total, terms[0].z_max)
-        if used:
-            to_low = vec2()
-            if TWO_PART_POINTS:
-                to_low = point_low[begin + k]
-            end = end_point(at, low, to, to_low, HALF, guard)
-            slope = distance_slope(table, origin + end.cell, end, window)
-            distance = vec2(slope.x, slope.y)
-            total = add_term(total, log_field(distance, terms))
-            bend = shape_weight(field_square(distance, terms).x, terms[0].shape_power, terms[0].shape_rate)
-            weight = TWO * terms[0].square_scale * hit_share(distance, terms) * bend
-            sums = add_slope(sums, slope, weight, at, vec2(to.x + mount_x, to.y + mount_y), resolution)
-        k += 1
+    total, sums = add_readings(
+        vec2(constant_term, ZERO), Sums(), table, pose_cell[n], pose[n], low, point, point_low, terms, begin,
+        begin + size, 1, window, guard, vec2(mount_x, mount_y), resolution,
+    )  # fmt: skip
     out = n * GRADIENT_NUMBERS
-    if wp.isinf(total.x):
-        gradient[out] = total.x
-    else:
-        gradient[out] = score.temperature * (total.x + total.y)
+    gradient[out] = scaled_sum(total, score.temperature)
     for i in range(6):
         gradient[out + 1 + i] = score.temperature * sums[i]
     # The other rows of the symmetric information matrix.

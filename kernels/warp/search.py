@@ -159,7 +159,8 @@ def divided(
     return total
 
 
-# With IN_TEAMS the work-items of a group, which is a warp, share a block; on processors the first member takes all points.
+# With IN_TEAMS the work-items of a group, which is a warp, share a block; on processors the first member takes all
+# points.
 TEAM = 1
 
 

@@ -46,12 +46,13 @@ KERNELS: dict[str, Kernel] = {
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
         "Score score", "ScanBatch batch if SCANS", in_lanes=True,
     ),
-    "climb_step": kernel(
-        "field_climb", "part", f"real gradient [{GRADIENT_NUMBERS} * parts * scans]",
-        "out double poses [3 * parts * scans]", f"double climb [{CLIMB} * scans]", f"out double moved [{CLIMB} * scans]",
-        "out int2 pose_cell [parts * scans]", "out real4 pose [parts * scans]", "out real4 pose_low [parts * scans]",
-        "out int pose_status [2]", "int scans", "int parts", "int most", "double small", "double yaw_cos",
-        "double yaw_sin", "Frame frame", WINDOW,
+    "climb_field": kernel(
+        "field_climb", "scan", "real table [(window.rows + 4) * (window.cols + 4)]", "out double poses [3 * scans]",
+        f"out double climb [{CLIMB} * scans]", "out int2 pose_cell [scans]", "out real4 pose [scans]",
+        "out real4 pose_low [scans]", "out int pose_status [2]", "real2 point [readings]", "real2 point_low [readings]",
+        "FieldTerms terms [1]", "int start [scans + 1] if SCANS", "real constant_terms [scans] if SCANS", "int scans",
+        "int readings", "real guard", "real mount_x", "real mount_y", "real resolution", "Score score", "int most",
+        "double small", "double yaw_cos", "double yaw_sin", "Frame frame", WINDOW, team=256,
     ),
     "fit_lines": kernel(
         "line_fit", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import get_backend
+from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
-from gpusense.backends.workspace import ChangingProgram, Workspace
+from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS
-from gpusense.interface.lanes import with_lanes_flag
+from gpusense.interface.lanes import with_lanes_flag, with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
@@ -25,17 +25,14 @@ from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.pipeline import Request
 from gpusense.models.scan.readings import Readings, placing_launches
-from gpusense.reference.field_climb import CALM, DAMPING, ENDED, START, STEPS
+from gpusense.reference.field_climb import CALM, DAMPING, ENDED, START, STEPS, climb_step
 
 # Flags of the mixture that have no meaning for the kernel.
 _OTHERS = {"LOG_TABLE", "CUBES"}
-# Steps of a climb at most, how far a climb leads from its start, and a little more [m], and pairs of steps between two
-# reads by kind of device.
-_MOST_STEPS, _FARTHEST, _PAIRS_AT_ONCE = 50, 5.5, {"gpu": 3, "cpu": 2}
+# Steps of a climb at most, and how far a climb leads from its start, and a little more [m].
+_MOST_STEPS, _FARTHEST = 50, 5.5
 # Length and turn of a step that end a climb [m, rad], by the bytes of a number.
 _SMALL = {4: 3e-4, 8: 1e-4}
-# Parts of a scan in a climb, by kind of device.
-_PARTS = {"gpu": 64, "cpu": 1}
 
 
 class Gradients:
@@ -60,11 +57,7 @@ class Gradients:
         if (value := self._pipeline.value(scans)) is not None:
             rows[:, 0] = value
         else:
-            self._run(request.poses, piece, self._pipeline.upload(self._split(scans), self._space), rows)
-
-    def _split(self, scans: ClassedScans) -> ClassedScans:
-        """Return scans to copy."""
-        return scans
+            self._run(request.poses, piece, self._pipeline.upload(scans, self._space), rows)
 
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         """Evaluate the poses of a piece."""
@@ -74,38 +67,42 @@ class Gradients:
 
     def _program(self, poses: Poses, piece: Piece, readings: Readings) -> tuple[Program, Buffer, PlacedPoses]:
         """Return the launches for the poses of a piece, the buffer of their results, and the placed poses."""
-        pipeline, space = self._pipeline, self._space
-        placed, state = pipeline.place(poses, piece.part, space)
-        numbers = space.empty("gradient", GRADIENT_NUMBERS * piece.count, pipeline.real)
-        resolution = pipeline.grid.resolution
-        mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
-        flags = (pipeline.components | readings.flags) - _OTHERS
-        flags = with_lanes_flag(pipeline.backend.info.lanes, "field_gradient", flags)
+        placed, flags, arguments = self._arguments(poses, piece, readings)
+        flags = with_lanes_flag(self._pipeline.backend.info.lanes, "field_gradient", flags)
         # The particles of a work-item's lanes belong to one scan.
         per_scan = piece.count // readings.scans
         size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
+        numbers = self._space.empty("gradient", GRADIENT_NUMBERS * piece.count, self._pipeline.real)
         gradient = launch(
-            "field_gradient", flags, (size,), table=state.table, pose_cell=placed.cell, pose=placed.pose,
-            pose_low=placed.low, terms=pipeline.terms, gradient=numbers, window=placed.frame.window,
-            particles=piece.count, readings=readings.readings, mount_x=mount_x, mount_y=mount_y, resolution=resolution,
-            score=Score(readings.constant_term, pipeline.context.temperature), batch=ScanBatch(per_scan, 0),
-            **readings.arguments | readings.constants | dict(guard=pipeline.guard * readings.reach),
+            "field_gradient", flags, (size,), gradient=numbers, particles=piece.count, batch=ScanBatch(per_scan, 0),
+            **arguments,
         )  # fmt: skip
         return (*placing_launches(placed, readings.placing), gradient), numbers, placed
 
+    def _arguments(
+        self, poses: Poses, piece: Piece, readings: Readings
+    ) -> tuple[PlacedPoses, frozenset[str], dict[str, Any]]:
+        """Place the poses of a piece; also return flags and arguments of kernels that evaluate them."""
+        pipeline = self._pipeline
+        placed, state = pipeline.place(poses, piece.part, self._space)
+        resolution = pipeline.grid.resolution
+        mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
+        arguments = dict(
+            table=state.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=pipeline.terms,
+            window=placed.frame.window, readings=readings.readings, mount_x=mount_x, mount_y=mount_y,
+            resolution=resolution, score=Score(readings.constant_term, pipeline.context.temperature),
+            **readings.arguments | readings.constants | dict(guard=pipeline.guard * readings.reach),
+        )  # fmt: skip
+        return placed, (pipeline.components | readings.flags) - _OTHERS, arguments
+
 
 class Climbs(Gradients):
-    """Climbs of S poses, each with a scan, to maxima of the likelihood; see the kernel file ``field_climb``.
-
-    On GPUs a scan is split into parts, each with a pose, since a work-item evaluates a pose.
-    """
+    """Climbs of S poses, each with a scan, to maxima of the likelihood; see the kernel file ``field_climb``."""
 
     def __init__(self, pipeline: FieldPipeline, space: Workspace, poses: np.ndarray) -> None:
         super().__init__(pipeline, space)
-        self._small, yaw = _SMALL[pipeline.real.itemsize], pipeline.grid.origin[2]
-        self._turn = math.cos(yaw), math.sin(yaw)
-        info = pipeline.backend.info
-        self._parts = _PARTS[info.kind] if info.float64 else 1
+        small, yaw = _SMALL[pipeline.real.itemsize], pipeline.grid.origin[2]
+        self._rules: dict[str, Any] = dict(most=_MOST_STEPS, small=small, yaw_cos=math.cos(yaw), yaw_sin=math.sin(yaw))
         self._end = np.zeros((len(poses), CLIMB))
         self._end[:, :3], self._end[:, START : START + 2] = poses, poses[:, :2]
         # A scan without readings has one step of length 0.
@@ -116,61 +113,37 @@ class Climbs(Gradients):
         """The poses (S, 3), the numbers of steps, and whether the last step was small."""
         return self._end[:, :3], self._end[:, STEPS], self._end[:, CALM] > 0
 
-    def _split(self, scans: ClassedScans) -> ClassedScans:
-        """See Gradients._split; the first part of a scan has its constant term."""
-        parts = self._parts
-        if parts == 1:
-            return scans
-        counts = ((scans.counts[:, None] + np.arange(parts)[::-1]) // parts).ravel()
-        constants = np.full((scans.scans, parts), -self._pipeline.context.constant_term)
-        constants[:, 0] = scans.constants
-        return ClassedScans(
-            scans.columns, scans.readings, scans.vectors, scans.rays, scans.ray_offsets, counts, counts,
-            constants.ravel(), scans.left_out,
-        )  # fmt: skip
-
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
-        """Climb from the poses of a piece, several steps at once where the device has float64."""
+        """Climb from the poses of a piece."""
         backend, space, end = self._pipeline.backend, self._space, self._end[piece.begin : piece.end]
         end[:, STEPS], end[:, CALM] = -1, 0
-        flags, parts, count = frozenset({"FLOAT64"}) & self._pipeline.components, self._parts, piece.count
-        pose = np.repeat(end[:, :3], parts, axis=0)
-        program, gradient, placed = self._placed(pose, readings)
-        numbers = dict(scans=count, parts=parts, most=_MOST_STEPS, small=self._small, yaw_cos=self._turn[0],
-                       yaw_sin=self._turn[1])  # fmt: skip
-        arguments = placed.arguments()
-        del arguments["particles"]
-        if backend.info.float64:
-            there, moved = space.upload("climb", end), space.empty("climb moved", end.size, end.dtype)
-            steps = [
-                launch("climb_step", flags | placed.flags, (parts * count,), gradient=gradient, climb=before, moved=after,
-                       **numbers, **arguments)
-                for before, after in ((there, moved), (moved, there))
-            ]  # fmt: skip
-            climb = ChangingProgram(backend, (program[-1], steps[0], program[-1], steps[1]), ())
-            backend.run(program[:-1])
+        pose = end[:, :3].copy()
+        if not backend.info.float64:
+            # The host takes the steps.
             while not end[:, ENDED].all():
-                for _ in range(_PAIRS_AT_ONCE[backend.info.kind]):
-                    climb({})
-                space.read(there, end)
+                program, gradient, _ = self._program(_moving(pose, backend), Piece(0, piece.count, 1), readings)
+                backend.run(program)
+                space.read(gradient, rows)
+                climb_step(end, pose, rows, **self._rules)
             return
-        # The host places poses of the next step by another call.
-        climb_step, real = get_backend("numpy").compile("climb_step", flags), self._pipeline.real
-        room = np.empty(2 * len(pose), np.int32), *np.empty((2, 4 * len(pose)), real), np.zeros(2, np.int32)
-        while not end[:, ENDED].all():
-            backend.run(program)
-            space.read(gradient, rows)
-            climb_step(
-                (count,), rows.reshape(-1), pose.reshape(-1), *(end.reshape(-1),) * 2, *room, *numbers.values(),
-                arguments["frame"], arguments["window"],
-            )  # fmt: skip
-            program = self._placed(pose, readings)[0]
+        placed, flags, arguments = self._arguments(_moving(pose, backend), Piece(0, piece.count, 1), readings)
+        flags, team = with_teams_flags(
+            backend.info.kind, "climb_field", flags | placed.flags, readings.readings, backend.largest_group
+        )
+        there, given = space.upload("climb", end), placed.arguments()
+        climb = launch(
+            "climb_field", flags, (piece.count * team,), poses=given["poses"], climb=there, frame=given["frame"],
+            pose_status=given["pose_status"], scans=piece.count, **arguments, **self._rules,
+        )  # fmt: skip
+        backend.run((*placing_launches(placed, readings.placing), climb))
+        space.read(there, end)
 
-    def _placed(self, pose: np.ndarray, readings: Readings) -> tuple[Program, Buffer, PlacedPoses]:
-        """Return the launches for (M, 3) poses that will move; see ``_program``."""
-        poses = Poses(pose, self._pipeline.backend, late=True)
-        poses.reach = _FARTHEST
-        return self._program(poses, Piece(0, len(pose), 1), readings)
+
+def _moving(pose: np.ndarray, backend: Backend) -> Poses:
+    """Return (M, 3) poses that will move."""
+    poses = Poses(pose, backend, late=True)
+    poses.reach = _FARTHEST
+    return poses
 
 
 def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

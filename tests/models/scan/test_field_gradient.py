@@ -6,12 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from support.kernel_scenes import run
 
 import gpusense as gs
-from gpusense.backends import get_backend
-from gpusense.interface.structs import Frame, Window
-from gpusense.models.scan import field_gradient
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.05, count=80, range_max=6.0, mount=(0.3, -0.1, 0.4))
 PARAMETERS = {
@@ -110,45 +106,41 @@ def test_vectors_hold_particles_of_one_scan(device):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
 
 
+def climbing_scene():
+    """Return a turned map, poses, and a scan near each: the second has no readings, the last is of another place."""
+    grid, poses, _ = scene((3.0, 1.0, 0.4), poses=24)
+    ranges = gs.RayCaster(grid, 6.0, backend="numpy").cast(poses, SCANNER.bearings)
+    ranges[1], ranges[-1] = np.nan, ranges[0]
+    return grid, poses + np.random.default_rng(5).normal(0, (0.05, 0.05, 0.02), poses.shape), ranges
+
+
 @pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", ["opencl", "warp"])
-@pytest.mark.parametrize("real", [np.float32, np.float64])
-def test_steps_of_climbs_are_those_of_the_reference(name, real, needs):
-    rng = np.random.default_rng(1)
-    slope = rng.normal(size=(40, 3, 3))
-    numbers = np.column_stack(
-        [rng.normal(size=40), rng.normal(size=(40, 3)), (slope @ slope.swapaxes(1, 2)).reshape(40, 9)]
-    )
-    # The two parts of a scan have equal poses.
-    poses, climbs = rng.uniform(-1, 1, (20, 3)).repeat(2, axis=0), rng.uniform(0.1, 1, (40, 19))
-    climbs[:, 7], climbs[:, 10], climbs[:, 12] = 3, 4, 5
-    # Climbs that begin, continue, lead too far, and have ended.
-    climbs[:, 16], climbs[:5, 16], climbs[:, 17:] = 7, -1, 0
-    climbs[5:8, 13], climbs[8:12, 18], climbs[12:15, :3] = 6, 1, poses[24:30:2] + 1e-5
-    flags = frozenset({"FLOAT64"}) if real is np.float64 else frozenset()
-    call = ("climb_step", flags, (40,), numbers.astype(real).ravel(), poses.ravel(), climbs[:20].ravel())
-    call += (np.zeros(380), np.zeros(80, np.int32), *np.zeros((2, 160), real), np.zeros(2, np.int32), 20, 2, 9, 1e-4, 0.8, 0.6)
-    call += (Frame(0.1, -0.2, 0.05, 0.1, 0.2, 0.8, 0.6), Window(-400, -400, 900, 900))
-    expected, got = run(get_backend("numpy"), *call), run(get_backend(needs(name)), *call)
-    assert np.isin(expected["moved"].reshape(20, 19)[:, 17], [0, 1]).all()
-    for output, values in expected.items():
-        np.testing.assert_allclose(got[output], values, rtol=1e-9, atol=1e-12)
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_climbs_end_where_those_of_the_reference_do(name, real, needs, monkeypatch):
+    grid, poses, ranges = climbing_scene()
+    ends, steps, calm = field(grid, "numpy", precision=real)._climb(poses, ranges)
+    assert calm.all() and steps[1] == 1 and (ends[1] == poses[1]).all() and steps.max() > 30
+    device, atol = field(grid, needs(name), precision=real), {"float32": 2e-3, "float64": 1e-9}[real]
+    for kind in ("cpu", "gpu"):
+        # With the kernels of GPUs, of which Warp's let the first member of a team take all readings here.
+        monkeypatch.setattr(
+            device._context.backend, "info", dataclasses.replace(device._context.backend.info, kind=kind, lanes=1)
+        )
+        found = device._climb(poses, ranges)
+        np.testing.assert_allclose(found[0], ends, atol=atol)
+        if real == "float64":
+            np.testing.assert_array_equal(found[1:], [steps, calm])
 
 
-def test_climbs_of_parts_of_scans_and_without_float64_have_the_same_ends(backend, monkeypatch):
-    grid, poses, _ = scene((3.0, 1.0, 0.4))
+def test_climbs_without_float64_have_the_same_ends(backend, monkeypatch):
+    grid, poses, ranges = climbing_scene()
     model = field(grid, backend, precision="float32")
-    ranges = gs.RayCaster(grid, 6.0, backend="numpy").cast(poses, SCANNER.bearings)
-    # A scan without readings stays.
-    ranges[1] = np.nan
-    ends, steps, calm = model._climb(poses, ranges)
-    # As on GPUs.
-    monkeypatch.setitem(field_gradient._PARTS, "cpu", 7)
-    np.testing.assert_allclose(model._climb(poses, ranges)[0], ends, atol=1e-5)
+    ends, _, calm = model._climb(poses, ranges)
     info = dataclasses.replace(model._context.backend.info, float64=False)
     monkeypatch.setattr(model._context.backend, "info", info)
-    np.testing.assert_allclose(model._climb(poses, ranges)[0], ends, atol=1e-5)
-    assert calm.mean() > 0.7 and steps[1] == 1 and (ends[1] == poses[1]).all()
+    np.testing.assert_allclose(model._climb(poses, ranges)[0], ends, atol=2e-3)
+    assert calm.all()
 
 
 def test_gradients_need_interpolation():

@@ -6,7 +6,7 @@
 #if READ_AHEAD
 #define STEP 16
 #else
-#define STEP 48
+#define STEP 24
 #endif
 #define TOGETHER 128
 #define FEW 4
@@ -90,6 +90,18 @@ kernel void fold_quarters(ARGUMENTS) {
     quarters[image * lines * stride + place] = packed_losses(TOP - unit * loss, four);
 }
 
+#if !READ_AHEAD
+// Vectors at any address; PoCL compiles loads of vectors as calls.
+typedef int16 Points __attribute__((aligned(4)));
+typedef int8 Images __attribute__((aligned(4)));
+
+// Return the nearest numbers from 0 to last.
+int8 within8(const int8 number, const int last) {
+    const int8 some = number < 0 ? 0 : number;
+    return some > last ? (int8)(last) : some;
+}
+#endif
+
 // Return the scores of a block's quarters: score less the losses of points begin to end - 1, apart from each other. Once all
 // are below least, the other points are left out. The columns of a table lie across on GPUs, see fold_quarters.
 int4 divided(global const int *quarters, global const int2 *point, global const int *image, const ScoreTable scores,
@@ -108,6 +120,22 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
         int even = 0, odd = 0;
 #if READ_AHEAD
 #pragma unroll 8
+#else
+        // A processor computes the places of eight points at once, and waits for several cells at a time.
+        int8 evens = 0, odds = 0;
+        for (; k + 8 <= stop; k += 8) {
+            const int16 both = *(global const Points *)(point + k);
+            const int8 line = within8(both.odd + (row + scores.margin), lines - 1);
+            const int8 aside = within8(both.even + (col + scores.margin), stride - 1);
+            const int8 at = *(global const Images *)(image + k) + line * stride + aside;
+            const int8 four = (int8)(quarters[at.s0], quarters[at.s1], quarters[at.s2], quarters[at.s3], quarters[at.s4],
+                                     quarters[at.s5], quarters[at.s6], quarters[at.s7]);
+            evens += four & 0xff00ff;
+            odds += four >> 8 & 0xff00ff;
+        }
+        const int8 pairs = evens, others = odds;
+        even = pairs.s0 + pairs.s1 + pairs.s2 + pairs.s3 + pairs.s4 + pairs.s5 + pairs.s6 + pairs.s7;
+        odd = others.s0 + others.s1 + others.s2 + others.s3 + others.s4 + others.s5 + others.s6 + others.s7;
 #endif
         for (; k < stop; k += apart) {
             const int line = within(point[k].y + row + scores.margin, lines - 1);

@@ -49,8 +49,9 @@ BEACON = 7
 # Kernel file ray_counts: fraction bits of a coordinate in cells.
 RAY_BITS = 12
 # Kernel file score_cells: columns of a run that a kernel in lanes reads at once, neighbouring rows of shifts that a
-# work-item sums, each of which a table's margin holds; and the largest score of a cell.
-RUN, SHIFT_ROWS, TOP = 32, 8, 255
+# work-item sums, each of which a table's margin holds; the largest score of a cell; and the points whose losses, in
+# units of as many scores, fit a byte.
+RUN, SHIFT_ROWS, TOP, FEW = 32, 8, 255, 4
 # Kernel file icp_match: numbers of the result of a match, and of the rules of a level.
 MATCH_RESULT, MATCH_RULES = 35, 14
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
@@ -131,7 +132,7 @@ _NAMES = {
         FRACTION_TERMS CENTRAL CENTRAL_END CENTRAL_OFFSET OUTER_OFFSET OUTERMOST_OFFSET CENTRAL_OVER CENTRAL_UNDER
         OUTER_OVER OUTER_UNDER OUTERMOST_OVER OUTERMOST_UNDER""",
     "scan": "MAX_LEFT_OUT MAX_FIXED MAX_PLACED",
-    "score_cells": "RUN SHIFT_ROWS TOP",
+    "score_cells": "RUN SHIFT_ROWS TOP FEW",
     "segments": "LINE_NUMBERS",
     "weighing": """SHARE THRESHOLD SCALE PER_BEAM_SCALE SLOW_RATE FAST_RATE MOST_INJECTED TEMPERATURE DEPTH RUNGS LOWEST
         WEIGHT_SUMS LEFT TOTAL SAMPLE_SIZE RESAMPLED DEGENERATE RUNG STAGE EVIDENCE SLOW FAST INJECTED""",

@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
-from gpusense.interface.constants import RUN, SHIFT_ROWS, TOP
+from gpusense.interface.constants import FEW, RUN, SHIFT_ROWS, TOP
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.structs import ScoreTable
 
@@ -18,8 +18,6 @@ _NO_FLAGS: frozenset[str] = frozenset()
 # Levels between the blocks of a level and the steps of their first cells, by kind of device: processors need few images
 # in their caches, one level less for tables of more cells.
 _STEP, _FEW_CELLS = {"cpu": 3, "gpu": 8}, 1 << 20
-# Scores in a unit of the losses of folded tables, so that the losses of several points fit a byte.
-_UNIT = 4
 # Cells of a table and of its copies, which kernels index in 32 bits.
 _MOST_CELLS = (1 << 31) - 1
 
@@ -134,7 +132,7 @@ class ScoreTables:
         is an image for each first cell.
         """
         if level not in self._folded:
-            period, step, unit = self.stride << level, self.step(level), _UNIT if level else 1
+            period, step, unit = self.stride << level, self.step(level), FEW if level else 1
             cols, lines, tables = self._size
             size = -(-lines // period), -(-cols // period)
             flags = with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS)

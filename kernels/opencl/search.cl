@@ -1,15 +1,13 @@
 // Exhaustive search over poses: sums of a table's cells over the end points of a scan; see the reference.
 // requires: score_cells
 
-// Points after which sums are compared, points whose losses fit 15 bits, and points whose losses in units of at least as many
-// scores fit a byte.
+// Points after which sums are compared, and points whose losses fit 15 bits.
 #if READ_AHEAD
 #define STEP 16
 #else
 #define STEP 24
 #endif
 #define TOGETHER 128
-#define FEW 4
 // Numbers that count the lines of a scan by their scores.
 #define BINS 512
 // The distance of a shift from the first one of its line: lines are rows on processors.
@@ -90,18 +88,6 @@ kernel void fold_quarters(ARGUMENTS) {
     quarters[image * lines * stride + place] = packed_losses(TOP - unit * loss, four);
 }
 
-#if !READ_AHEAD
-// Vectors at any address; PoCL compiles loads of vectors as calls.
-typedef int16 Points __attribute__((aligned(4)));
-typedef int8 Images __attribute__((aligned(4)));
-
-// Return the nearest numbers from 0 to last.
-int8 within8(const int8 number, const int last) {
-    const int8 some = number < 0 ? 0 : number;
-    return some > last ? (int8)(last) : some;
-}
-#endif
-
 // Return the scores of a block's quarters: score less the losses of points begin to end - 1, apart from each other. Once all
 // are below least, the other points are left out. The columns of a table lie across on GPUs, see fold_quarters.
 int4 divided(global const int *quarters, global const int2 *point, global const int *image, const ScoreTable scores,
@@ -124,18 +110,16 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
         // A processor computes the places of eight points at once, and waits for several cells at a time.
         int8 evens = 0, odds = 0;
         for (; k + 8 <= stop; k += 8) {
-            const int16 both = *(global const Points *)(point + k);
-            const int8 line = within8(both.odd + (row + scores.margin), lines - 1);
-            const int8 aside = within8(both.even + (col + scores.margin), stride - 1);
-            const int8 at = *(global const Images *)(image + k) + line * stride + aside;
+            const int8 at = block_indices(point + k, image + k, scores, row, col, 0, 0);
             const int8 four = (int8)(quarters[at.s0], quarters[at.s1], quarters[at.s2], quarters[at.s3], quarters[at.s4],
                                      quarters[at.s5], quarters[at.s6], quarters[at.s7]);
             evens += four & 0xff00ff;
             odds += four >> 8 & 0xff00ff;
         }
-        const int8 pairs = evens, others = odds;
-        even = pairs.s0 + pairs.s1 + pairs.s2 + pairs.s3 + pairs.s4 + pairs.s5 + pairs.s6 + pairs.s7;
-        odd = others.s0 + others.s1 + others.s2 + others.s3 + others.s4 + others.s5 + others.s6 + others.s7;
+        for (int i = 0; i < 8; ++i) {
+            even += ((const int *)&evens)[i];
+            odd += ((const int *)&odds)[i];
+        }
 #endif
         for (; k < stop; k += apart) {
             const int line = within(point[k].y + row + scores.margin, lines - 1);

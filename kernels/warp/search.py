@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from gpusense.interface.constants import SHIFT_ROWS, TOP
+from gpusense.interface.constants import FEW, SHIFT_ROWS, TOP
 
 from .flags import IN_TEAMS
 from .prelude import kernel, on_gpu, reader, work_item
@@ -11,12 +11,10 @@ from .score_cells import ScoreTable, block_index, padded_lines, padded_stride, w
 number_at, cell_at = reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
-# Points after which sums are compared, points that are read together, points whose losses fit 15 bits, and points whose
-# losses in units of at least as many scores fit a byte.
+# Points after which sums are compared, points that are read together, and points whose losses fit 15 bits.
 STEP = 16
 AT_ONCE = 8
 TOGETHER = 128
-FEW = 4
 # Numbers that count the lines of a scan by their scores.
 BINS = 512
 

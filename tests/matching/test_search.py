@@ -145,7 +145,7 @@ def test_exact_bounds_divide_fewer_blocks(name, monkeypatch, needs):
     scores, points, grid = scene(3)
     results = []
     for step, unit in ((2, 8), (8, 1)):
-        for limit, value in (("_STEP", dict.fromkeys(("cpu", "gpu"), step)), ("_UNIT", unit)):
+        for limit, value in (("_STEP", dict.fromkeys(("cpu", "gpu"), step)), ("FEW", unit)):
             monkeypatch.setattr(f"gpusense.matching.score_tables.{limit}", value)
         results.append(Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50))
     rounded, exact = results

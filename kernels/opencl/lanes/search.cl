@@ -3,10 +3,17 @@
 
 // A vector of RUN bytes at any address; PoCL compiles loads of vectors as calls.
 typedef uint8 unaligned __attribute__((aligned(1)));
+#define RUN_AT(cells) (*(global const unaligned *)(cells))
+
+// Add bytes to sums of 16 bits: two neighbouring bytes are one number of 16 bits, so that no byte is converted.
+void add_run(ushort16 *even, ushort16 *odd, const uint8 bytes) {
+    *even += as_ushort16(bytes) & (ushort16)0xff;
+    *odd += as_ushort16(bytes) >> (ushort16)8;
+}
 
 // Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
-// shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of RUN shifts of an item. The losses of together
-// points fit a byte, and those of 256 times as many points fit 16 bits. The table holds bytes.
+// shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of RUN shifts of an item. The losses of 256 points fit
+// 16 bits. The table holds bytes.
 kernel void shift_scores(ARGUMENTS) {
     const int col = RUN * get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
@@ -14,30 +21,28 @@ kernel void shift_scores(ARGUMENTS) {
     int some = 0;
     for (int i = 0; i < rows; ++i)
         for (int j = 0; j < cols; ++j) some |= allowed[(row + i) * width + col + j];
-    const int stride = padded_stride(scores), together = 255 / (TOP / unit);
-    const int last = some ? first[item + 1] : first[item];
+    const int stride = padded_stride(scores), last = some ? first[item + 1] : first[item];
+    global const uchar *cells = (global const uchar *)table;
     uint total[SHIFT_ROWS][RUN] = {{0}};
     for (int k = first[item]; k < last;) {
         ushort16 even[SHIFT_ROWS], odd[SHIFT_ROWS];
 #pragma unroll
         for (int i = 0; i < SHIFT_ROWS; ++i) even[i] = odd[i] = (ushort16)0;
-        for (int round = 0; round < 256 && k < last; ++round) {
-            uint8 few[SHIFT_ROWS];
-#pragma unroll
-            for (int i = 0; i < SHIFT_ROWS; ++i) few[i] = (uint8)0;
-            const int stop = last - k > together ? k + together : last;
-            for (; k < stop; ++k) {
-                global const uchar *cells = (global const uchar *)table + image[k] +
-                                            block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, RUN - 1);
-#pragma unroll
-                for (int i = 0; i < SHIFT_ROWS; ++i) few[i] += *(global const unaligned *)(cells + i * stride);
-            }
-            // Two neighbouring bytes are one number of 16 bits, so that no byte is converted.
+        const int stop = last - k > 256 ? k + 256 : last;
+        for (; unit >= FEW && k + 8 <= stop; k += 8) {
+            const int8 at = block_indices(point + k, image + k, scores, row, col, SHIFT_ROWS - 1, RUN - 1);
 #pragma unroll
             for (int i = 0; i < SHIFT_ROWS; ++i) {
-                even[i] += as_ushort16(few[i]) & (ushort16)0xff;
-                odd[i] += as_ushort16(few[i]) >> (ushort16)8;
+                global const uchar *here = cells + i * stride;
+                add_run(&even[i], &odd[i], RUN_AT(here + at.s0) + RUN_AT(here + at.s1) + RUN_AT(here + at.s2) + RUN_AT(here + at.s3));
+                add_run(&even[i], &odd[i], RUN_AT(here + at.s4) + RUN_AT(here + at.s5) + RUN_AT(here + at.s6) + RUN_AT(here + at.s7));
             }
+        }
+        for (; k < stop; ++k) {
+            global const uchar *here =
+                cells + image[k] + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, RUN - 1);
+#pragma unroll
+            for (int i = 0; i < SHIFT_ROWS; ++i) add_run(&even[i], &odd[i], RUN_AT(here + i * stride));
         }
 #pragma unroll
         for (int i = 0; i < SHIFT_ROWS; ++i) {

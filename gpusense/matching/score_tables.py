@@ -15,9 +15,10 @@ from gpusense.interface.structs import ScoreTable
 
 _BYTE, _INT = np.dtype(np.uint8), np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Levels between the blocks of a level and the steps of their first cells, by kind of device: processors need few images
-# in their caches, one level less for tables of more cells.
-_STEP, _FEW_CELLS = {"cpu": 3, "gpu": 8}, 1 << 20
+# Levels between the blocks of a level and the steps of their first cells, and scores in a unit of the losses of folded
+# tables, by kind of device: processors add losses of several points in a byte, and need few images in their caches, one
+# level less for tables of more cells.
+_STEP, _UNIT, _FEW_CELLS = {"cpu": 3, "gpu": 8}, {"cpu": FEW, "gpu": 1}, 1 << 20
 # Cells of a table and of its copies, which kernels index in 32 bits.
 _MOST_CELLS = (1 << 31) - 1
 
@@ -132,7 +133,7 @@ class ScoreTables:
         is an image for each first cell.
         """
         if level not in self._folded:
-            period, step, unit = self.stride << level, self.step(level), FEW if level else 1
+            period, step, unit = self.stride << level, self.step(level), _UNIT[self.backend.info.kind] if level else 1
             cols, lines, tables = self._size
             size = -(-lines // period), -(-cols // period)
             flags = with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS)

@@ -161,37 +161,26 @@ kernel void pack_rows(ARGUMENTS) {
     packed[(image * lines + line) * stride + col] = (int)four;
 }
 
-// Add the losses of SHIFT_ROWS rows of a column, four of them as bytes of a number.
-void add_rows(uint *sums, global const int *table, const ScoreTable scores, const int row, const int col) {
-    global const int *cells = table + block_index(scores, row, col, SHIFT_ROWS - 1, 0);
-    for (int i = 0; i < SHIFT_ROWS / 4; ++i) sums[i] += cells[4 * i * padded_stride(scores)];
-}
-
 // Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
 // shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 kernel void shift_scores(ARGUMENTS) {
     const int col = get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
-    int any = 0;
-    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) any |= allowed[(row + i) * width + col];
-    const int last = any ? first[item + 1] : first[item];
+    int some = 0;
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) some |= allowed[(row + i) * width + col];
+    const int stride = padded_stride(scores), last = some ? first[item + 1] : first[item];
     int total[SHIFT_ROWS] = {0};
     for (int k = first[item]; k < last;) {
         const int stop = last - k > TOGETHER ? k + TOGETHER : last;
         // Two sums of 16 bits in a number.
         uint even[SHIFT_ROWS / 4] = {0}, odd[SHIFT_ROWS / 4] = {0};
-        while (k < stop) {
-            const int few = unit >= FEW && stop - k >= FEW;
-            uint four[SHIFT_ROWS / 4] = {0};
-            if (few)
-                for (int j = k; j < k + FEW; ++j)
-                    add_rows(four, table + image[j], scores, point[j].y + row, point[j].x + col);
-            else
-                add_rows(four, table + image[k], scores, point[k].y + row, point[k].x + col);
-            k += few ? FEW : 1;
+        for (; k < stop; ++k) {
+            global const int *cells =
+                table + image[k] + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
             for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
-                even[i] += four[i] & 0xff00ff;
-                odd[i] += four[i] >> 8 & 0xff00ff;
+                const uint four = cells[4 * i * stride];
+                even[i] += four & 0xff00ff;
+                odd[i] += four >> 8 & 0xff00ff;
             }
         }
         for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
@@ -362,11 +351,16 @@ kernel void divide_blocks(ARGUMENTS) {
     for (int n = run * (get_global_id(0) / members); n < blocks; n += n % run == run - 1 ? run * (each - 1) + 1 : 1) {
         global const int *here = block + 4 * (begin + n);
         const int item = here[0], row = here[1], col = here[2], least = low[item / turns];
-        int4 sums = divided(quarters, point, image, scores, first[item] + member, first[item + 1], members,
-                            spacing * (row >> shift), spacing * (col >> shift), here[3], least, across);
+        const int line = spacing * (row >> shift), aside = spacing * (col >> shift), last = first[item + 1];
+        int4 sums;
+        // Two calls, so that the compiler knows how far points are apart.
 #if IN_TEAMS
-        if (members > 1) sums = left_by_team(shared, sums, here[3]);
+        if (members > 1) {
+            sums = divided(quarters, point, image, scores, first[item] + member, last, TEAM, line, aside, here[3], least, across);
+            sums = left_by_team(shared, sums, here[3]);
+        } else
 #endif
+            sums = divided(quarters, point, image, scores, first[item], last, 1, line, aside, here[3], least, across);
         if (member > 0) continue;
         const int total[4] = {sums.x, sums.y, sums.z, sums.w};
         for (int i = 0; i < 4; ++i) {

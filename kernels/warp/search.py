@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from gpusense.interface.constants import FEW, SHIFT_ROWS, TOP
+from gpusense.interface.constants import SHIFT_ROWS, TOP
 
 from .flags import IN_TEAMS
 from .prelude import kernel, on_gpu, reader, work_item
@@ -198,15 +198,6 @@ def pack_rows(table, packed, scores):
     packed[(image * lines + line) * stride + col] = four
 
 
-@wp.func
-def add_rows(
-    sums: wp.vec2i, table: wp.array(dtype=wp.int32), image: wp.int32, scores: ScoreTable, row: wp.int32, col: wp.int32
-):  # fmt: skip
-    """Add the losses of SHIFT_ROWS rows of a column, four of them as bytes of a number."""
-    place = image + block_index(scores, row, col, SHIFT_ROWS - 1, 0)
-    return sums + wp.vec2i(number_at(table, place), number_at(table, place + 4 * padded_stride(scores)))
-
-
 @kernel
 def shift_scores(table, point, image, first, allowed, score, scores, items, height, width, unit):
     """Sum the losses of each item's points at all shifts, and write the scores; -1 where not allowed."""
@@ -214,11 +205,12 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
     row = SHIFT_ROWS * block
     if col >= width or row >= height or item >= items:
         return
-    any = int(0)
+    some = int(0)
     for i in range(wp.min(SHIFT_ROWS, height - row)):
-        any = any + int(allowed[(row + i) * width + col])
+        some = some + int(allowed[(row + i) * width + col])
+    stride = padded_stride(scores)
     last = first[item]
-    if any > 0:
+    if some > 0:
         last = first[item + 1]
     total = Rows()
     k = int(first[item])
@@ -228,19 +220,13 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
         even = wp.vec2i()
         odd = wp.vec2i()
         while k < stop:
-            four = wp.vec2i()
-            if unit >= FEW and stop - k >= FEW:
-                for j in range(FEW):
-                    cell = cell_at(point, k + j)
-                    four = add_rows(four, table, number_at(image, k + j), scores, cell.y + row, cell.x + col)
-                k = k + FEW
-            else:
-                cell = cell_at(point, k)
-                four = add_rows(four, table, number_at(image, k), scores, cell.y + row, cell.x + col)
-                k = k + 1
+            cell = cell_at(point, k)
+            place = number_at(image, k) + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
             for i in range(2):
-                even[i] = even[i] + (four[i] & 0xFF00FF)
-                odd[i] = odd[i] + ((four[i] >> 8) & 0xFF00FF)
+                four = number_at(table, place + 4 * i * stride)
+                even[i] = even[i] + (four & 0xFF00FF)
+                odd[i] = odd[i] + ((four >> 8) & 0xFF00FF)
+            k = k + 1
         for i in range(2):
             total[4 * i] = total[4 * i] + (even[i] & 0xFFFF)
             total[4 * i + 1] = total[4 * i + 1] + (odd[i] & 0xFFFF)
@@ -421,27 +407,36 @@ def divide_blocks(
     width, columns, turns, level, spacing, shift, across,
 ):  # fmt: skip
     """Divide blocks of positions into quarters, and collect those whose scores may be high enough."""
-    own = work_item(wp.tid())
+    worker = work_item(wp.tid())
     blocks = wp.min(count[level + 1] - begin, some)
     members = int(1)
     if IN_TEAMS and on_gpu() and blocks < workers:
         members = TEAM
-    member = own % members
+    member = worker % members
     each = workers // members
-    n = run * (own // members)
+    n = run * (worker // members)
     while n < blocks:
         here = 4 * (begin + n)
         item = block[here]
         row = block[here + 1]
         col = block[here + 2]
         least = low[item // turns]
-        total = divided(
-            quarters, point, image, scores, first[item] + member, first[item + 1], members, spacing * (row >> shift),
-            spacing * (col >> shift), block[here + 3], least, across,
-        )  # fmt: skip
-        if IN_TEAMS:
-            if members > 1:
-                total = left_by_team(total, block[here + 3])
+        line = spacing * (row >> shift)
+        aside = spacing * (col >> shift)
+        score = block[here + 3]
+        total = wp.vec4i()
+        # Two calls, so that the compiler knows how far points are apart.
+        if members > 1:
+            if IN_TEAMS:
+                own = divided(
+                    quarters, point, image, scores, first[item] + member, first[item + 1], TEAM, line, aside, score,
+                    least, across,
+                )  # fmt: skip
+                total = left_by_team(own, score)
+        else:
+            total = divided(
+                quarters, point, image, scores, first[item], first[item + 1], 1, line, aside, score, least, across
+            )
         if member == 0:
             for i in range(4):
                 part_row = row + ((i // 2) << level)

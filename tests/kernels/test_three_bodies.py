@@ -138,7 +138,6 @@ ON_PURPOSE = [
     Purpose("score_cells", "block_index", KERNELS_ONLY, "the reference clamps each cell by itself"),
     Purpose("score_cells", "cell_index", REFERENCE_ONLY, ARRAYS),
     Purpose("search", "_quarters_of", REFERENCE_ONLY, ARRAYS),
-    Purpose("search", "add_rows", KERNELS_ONLY, "the reference adds numbers that are not packed"),
     Purpose("search", "left_by_team", KERNELS_ONLY, "the reference has no teams"),
     Purpose("search_ends", "periods", KERNELS_ONLY, "NumPy's division of integers rounds down"),
     Purpose("search_ends", "cell_of", (OPENCL,), FLOOR),

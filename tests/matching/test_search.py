@@ -141,12 +141,12 @@ def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, n
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_exact_bounds_divide_fewer_blocks(name, monkeypatch, needs):
+def test_exact_bounds_as_on_gpus_divide_fewer_blocks(name, monkeypatch, needs):
     scores, points, grid = scene(3)
     results = []
     for step, unit in ((2, 8), (8, 1)):
-        for limit, value in (("_STEP", dict.fromkeys(("cpu", "gpu"), step)), ("FEW", unit)):
-            monkeypatch.setattr(f"gpusense.matching.score_tables.{limit}", value)
+        for limit, value in (("_STEP", step), ("_UNIT", unit)):
+            monkeypatch.setattr(f"gpusense.matching.score_tables.{limit}", dict.fromkeys(("cpu", "gpu"), value))
         results.append(Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50))
     rounded, exact = results
     for field in ("scan", "row", "col", "heading", "score"):

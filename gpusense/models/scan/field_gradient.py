@@ -127,8 +127,9 @@ class Climbs(Gradients):
                 climb_step(end, pose, rows, **self._rules)
             return
         placed, flags, arguments = self._arguments(_moving(pose, backend), Piece(0, piece.count, 1), readings)
+        # A scan has the same team alone and among others.
         flags, team = with_teams_flags(
-            backend.info.kind, "climb_field", flags | placed.flags, readings.readings, backend.largest_group
+            backend.info.kind, "climb_field", flags | placed.flags, self._pipeline.scanner.count, backend.largest_group
         )
         there, given = space.upload("climb", end), placed.arguments()
         climb = launch(

@@ -40,6 +40,8 @@ _MOST_ITEMS, _MOST_BLOCKS, _MEMORY = 1 << 15, {"cpu": 1 << 25, "gpu": 1 << 29}, 
 # Poses of a scan that are read together with their number; by kind of device, work-items that divide blocks, and the
 # neighbouring blocks that each of them takes at a time.
 _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
+# Least number of bounds of which so many are divided that teams share no block: their groups fill half of a GPU.
+_MANY = 1 << 20
 # Numbers of points are rounded up to multiples of this.
 _POINTS = 64
 # Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
@@ -278,12 +280,13 @@ class _Run:
         (workers, run), blocks = _WORKERS[self._backend.info.kind], self._chosen
         for level in reversed(range(self._level)):
             (quarters, shape, spacing), first = self._quarters(level), level == self._level - 1
+            plain = first and self._items * self._height * self._width >= _MANY
             parts = self._space.empty(f"parts {level}", 4 * self._parts, _INT)
             self._launch(
                 "divide_blocks", (workers,), *quarters, self._allowed[level], blocks, self._low, parts, self._counts,
                 shape, begin if first else 0, min(some, self._room) if first else self._parts, self._parts, workers,
                 run, self._grid.height, self._grid.width, -(-self._grid.width >> level), self._turns, level, *spacing,
-                flags=self._in_teams,
+                flags=self._ahead if plain else self._in_teams,
             )  # fmt: skip
             blocks = parts
         self._poses = blocks

@@ -337,13 +337,13 @@ kernel void follow_blocks(ARGUMENTS) {
 // Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level, and
 // collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which the caller
 // clears, may exceed room: then some are left out. Of workers work-items each takes run neighbouring blocks at a time; with
-// IN_TEAMS a team shares a block where there are fewer blocks than work-items.
+// IN_TEAMS a team shares a block where there are few blocks.
 kernel void divide_blocks(ARGUMENTS) {
     if (get_global_id(0) >= workers) return;
     const int left = count[level + 1] - begin, blocks = left < some ? left : some, quarter = 1 << level;
 #if IN_TEAMS
     local int4 shared[TEAM];
-    const int members = blocks < workers ? TEAM : 1, member = get_local_id(0) % members;
+    const int members = blocks < workers / 4 ? TEAM : 1, member = get_local_id(0) % members;
 #else
     const int members = 1, member = 0;
 #endif

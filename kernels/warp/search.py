@@ -410,7 +410,7 @@ def divide_blocks(
     worker = work_item(wp.tid())
     blocks = wp.min(count[level + 1] - begin, some)
     members = int(1)
-    if IN_TEAMS and on_gpu() and blocks < workers:
+    if IN_TEAMS and on_gpu() and blocks < workers // 4:
         members = TEAM
     member = worker % members
     each = workers // members

@@ -40,7 +40,7 @@ _MOST_ITEMS, _MOST_BLOCKS, _MEMORY = 1 << 15, {"cpu": 1 << 25, "gpu": 1 << 29}, 
 # Poses of a scan that are read together with their number; by kind of device, work-items that divide blocks, and the
 # neighbouring blocks that each of them takes at a time.
 _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
-# Least number of bounds of which so many are divided that teams share no block: their groups fill half of a GPU.
+# Least number of first blocks of which teams share none: many are divided, and groups of teams fill half of a GPU.
 _MANY = 1 << 20
 # Numbers of points are rounded up to multiples of this.
 _POINTS = 64

@@ -82,7 +82,8 @@ void climb_step(double *at, double *tried, const double *numbers, const int most
 // Replace numbers by their sums over the team.
 void add_over_members(double *numbers, local double *shared) {
     local double *mine = shared + get_local_id(0);
-    barrier(CLK_LOCAL_MEM_FENCE);
+    // All members have written the last pose before one writes the next.
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     for (int i = 0; i < CLIMB_SUMS; ++i) mine[TEAM * i] = numbers[i];
     for (int apart = TEAM / 2; apart > 0; apart /= 2) {
         barrier(CLK_LOCAL_MEM_FENCE);

@@ -28,7 +28,7 @@ _NO_FLAGS: frozenset[str] = frozenset()
 # Numbers that count the lines of a scan by their scores, as in the kernel file.
 BINS = 512
 # Blocks of a scan that are followed down to poses for its first lower bound.
-_FOLLOWED = 512
+_FOLLOWED = 1024
 # Sums of a scan's bounds that a level of smaller blocks may take, by kind of device.
 _MOST_SUMS = {"cpu": 1 << 29, "gpu": 1 << 32}
 # Room at first for chosen blocks of a scan, room for their parts on each level by kind of device, a sixteenth of which

@@ -61,12 +61,12 @@ class Gradients:
 
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         """Evaluate the poses of a piece."""
-        program, numbers, _ = self._program(poses, piece, readings)
+        program, numbers = self._program(poses, piece, readings)
         self._pipeline.backend.run(program)
         self._space.download(numbers, rows)
 
-    def _program(self, poses: Poses, piece: Piece, readings: Readings) -> tuple[Program, Buffer, PlacedPoses]:
-        """Return the launches for the poses of a piece, the buffer of their results, and the placed poses."""
+    def _program(self, poses: Poses, piece: Piece, readings: Readings) -> tuple[Program, Buffer]:
+        """Return the launches for the poses of a piece, and the buffer of their results."""
         placed, flags, arguments = self._arguments(poses, piece, readings)
         flags = with_lanes_flag(self._pipeline.backend.info.lanes, "field_gradient", flags)
         # The particles of a work-item's lanes belong to one scan.
@@ -77,7 +77,7 @@ class Gradients:
             "field_gradient", flags, (size,), gradient=numbers, particles=piece.count, batch=ScanBatch(per_scan, 0),
             **arguments,
         )  # fmt: skip
-        return (*placing_launches(placed, readings.placing), gradient), numbers, placed
+        return (*placing_launches(placed, readings.placing), gradient), numbers
 
     def _arguments(
         self, poses: Poses, piece: Piece, readings: Readings
@@ -121,7 +121,7 @@ class Climbs(Gradients):
         if not backend.info.float64:
             # The host takes the steps.
             while not end[:, ENDED].all():
-                program, gradient, _ = self._program(_moving(pose, backend), Piece(0, piece.count, 1), readings)
+                program, gradient = self._program(_moving(pose, backend), Piece(0, piece.count, 1), readings)
                 backend.run(program)
                 space.read(gradient, rows)
                 climb_step(end, pose, rows, **self._rules)

@@ -44,8 +44,8 @@ void add_slope(real *sums, const real4 slope, const real weight, const real4 at,
     sums[8] += weight * turn * turn;
 }
 
-// Add the readings of a scan from one on, apart from each other, to log p and to the sums of add_slope. mount is the sensor's
-// place on the robot in cells.
+// Add every apart-th reading of a scan from the first to log p and to the sums of add_slope. mount is the sensor's place on
+// the robot in cells.
 real2 add_readings(const real2 before, real *sums, global const real *table, const int2 origin, const real4 at, const real4 low,
                    global const real2 *point, global const real2 *point_low, global const FieldTerms *terms, const int first,
                    const int size, const int apart, const Window window, const real guard, const real2 mount,

@@ -79,7 +79,7 @@ def add_readings(
     point: wp.array(dtype=vec2), point_low: wp.array(dtype=vec2), terms: wp.array(dtype=FieldTerms), first: wp.int32,
     end_of_scan: wp.int32, apart: wp.int32, window: Window, guard: real, mount: vec2, resolution: real,
 ):  # fmt: skip
-    """Return log p and the sums of add_slope with the readings of a scan from one on, apart from each other."""
+    """Return log p and the sums of add_slope with every apart-th reading of a scan from the first."""
     total = before
     sums = begun
     k = int(first)

@@ -19,112 +19,13 @@ TOGETHER = 128
 BINS = 512
 
 
-@kernel
-def pool_scores(table, pooled, scores, reach):
-    """Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell."""
-    image, line, col = wp.tid()
-    lines = padded_lines(scores)
-    stride = padded_stride(scores)
-    if col >= stride or line >= lines or image >= scores.tables:
-        return
-    begin = image * lines * stride
-    low = begin + wp.min(line + reach, lines - 1) * stride
-    right = wp.min(col + reach, stride - 1)
-    upper = wp.max(table[begin + line * stride + col], table[begin + line * stride + right])
-    lower = wp.max(table[low + col], table[low + right])
-    pooled[begin + line * stride + col] = wp.max(upper, lower)
-
-
-@kernel
-def fold_scores(table, out, scores, folded, period, step, beyond, unit):
-    """Write the losses of every period-th row and column of each padded table as images."""
-    image, line, col = wp.tid()
-    lines = padded_lines(folded)
-    stride = padded_stride(folded)
-    if col >= stride or line >= lines or image >= folded.tables:
-        return
-    side = period // step
-    source = image // (side * side)
-    phase = image % (side * side)
-    from_line = (line - folded.margin) * period + phase // side * step
-    from_col = (col - folded.margin) * period + phase % side * step
-    rows = padded_lines(scores)
-    cols = padded_stride(scores)
-    value = int(beyond)
-    if line >= folded.margin and col >= folded.margin and from_line < rows and from_col < cols:
-        value = int(table[(source * rows + from_line) * cols + from_col])
-    out[(image * lines + line) * stride + col] = wp.uint8((TOP - value) // unit)
-
-
-@wp.func
-def quarters_at(
-    table: wp.array(dtype=wp.uint8), scores: ScoreTable, image: wp.int32, line: wp.int32, col: wp.int32, reach: wp.int32
-):  # fmt: skip
-    """Return the scores of the quarters of a block: upper left, upper right, lower left, lower right."""
-    lines = padded_lines(scores)
-    stride = padded_stride(scores)
-    here = (image * lines + line) * stride
-    low = (image * lines + wp.min(line + reach, lines - 1)) * stride
-    right = wp.min(col + reach, stride - 1)
-    return wp.vec4i(int(table[here + col]), int(table[here + right]), int(table[low + col]), int(table[low + right]))
-
-
-@wp.func
-def packed_losses(most: wp.int32, four: wp.vec4i):
-    """Return losses of quarters as bytes of a number."""
-    packed = int(0)
-    for i in range(4):
-        packed = packed | ((most - four[i]) << (8 * i))
-    return packed
-
-
-@kernel
-def pack_quarters(table, quarters, scores, reach):
-    """Write the losses of the quarters of the block that begins at each cell, relative to the largest score."""
-    image, line, col = wp.tid()
-    lines = padded_lines(scores)
-    stride = padded_stride(scores)
-    if col >= stride or line >= lines or image >= scores.tables:
-        return
-    four = quarters_at(table, scores, image, line, col, reach)
-    quarters[(image * lines + line) * stride + col] = packed_losses(wp.max(four), four)
-
-
-@kernel
-def fold_quarters(table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit, across):
-    """Write the losses of the quarters of blocks as images, relative to the scores in the folded table of bounds."""
-    image, line, col = wp.tid()
-    lines = padded_lines(folded)
-    stride = padded_stride(folded)
-    if col >= stride or line >= lines or image >= folded.tables:
-        return
-    source = image // (period * period)
-    row_phase = image // period % period
-    col_phase = image % period
-    whole_row = line - folded.margin
-    whole_col = col - folded.margin
-    side = period // step
-    from_line = whole_row * period + row_phase
-    from_col = whole_col * period + col_phase
-    four = wp.vec4i(beyond, beyond, beyond, beyond)
-    if whole_row >= 0 and whole_col >= 0 and from_line < padded_lines(scores) and from_col < padded_stride(scores):
-        four = quarters_at(table, scores, source, from_line, from_col, reach)
-    coarse = (source * side + row_phase // step) * side + col_phase // step
-    begin = coarse * padded_lines(bounds) * padded_stride(bounds)
-    loss = int(bound[begin + block_index(bounds, whole_row, whole_col, 0, 0)])
-    place = line * stride + col
-    if across != 0:
-        place = col * lines + line
-    quarters[image * lines * stride + place] = packed_losses(TOP - unit * loss, four)
-
-
 @wp.func
 def divided(
     quarters: wp.array(dtype=wp.int32), point: wp.array(dtype=wp.vec2i), image: wp.array(dtype=wp.int32),
     scores: ScoreTable, begin: wp.int32, end: wp.int32, apart: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32,
     least: wp.int32, across: wp.int32,
 ):  # fmt: skip
-    """Return the scores of a block's quarters: score less the losses of points begin to end - 1, apart from others."""
+    """Return the scores of a block's quarters: score less the losses of every apart-th point from begin to end - 1."""
     lines = padded_lines(scores)
     stride = padded_stride(scores)
     down = int(stride)
@@ -157,8 +58,7 @@ def divided(
     return total
 
 
-# With IN_TEAMS the work-items of a group, which is a warp, share a block; on processors the first member takes all
-# points.
+# Work-items that share a block: a warp with IN_TEAMS. On processors the first of them takes all points.
 TEAM = 1
 
 
@@ -182,20 +82,6 @@ return own;
 # Return the scores of a block's quarters from those that the members of a team have left of the block's score.
 @wp.func_native(_LEFT_BY_TEAM)
 def left_by_team(own: wp.vec4i, score: wp.int32) -> wp.vec4i: ...
-
-
-@kernel
-def pack_rows(table, packed, scores):
-    """Write the losses of each cell and the three below it as bytes of a number."""
-    image, line, col = wp.tid()
-    lines = padded_lines(scores)
-    stride = padded_stride(scores)
-    if col >= stride or line >= lines or image >= scores.tables:
-        return
-    four = int(0)
-    for i in range(4):
-        four = four | (int(table[(image * lines + wp.min(line + i, lines - 1)) * stride + col]) << (8 * i))
-    packed[(image * lines + line) * stride + col] = four
 
 
 @kernel

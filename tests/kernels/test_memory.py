@@ -337,7 +337,7 @@ for count, width in zip((37, 2100, 37), lanes):
         near(found, right, atol=2e-2)
 both[0].info = before
 # A kernel that was never launched, in vectors where it has them, would be no proof.
-files = "field_gradient field_climb line_fit scan_pair icp search search_ends "
+files = "field_gradient field_climb line_fit scan_pair icp score_tables search search_ends "
 files += "motion weighing drawing estimate ray_counts"
 tried = {name: row for name, row in KERNELS.items() if row.file in files.split()}
 for name, row in tried.items():

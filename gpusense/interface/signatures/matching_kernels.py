@@ -73,22 +73,22 @@ KERNELS: dict[str, Kernel] = {
         group=4, team=256,
     ),
     "pool_scores": kernel(
-        "search", "col line image", _CELLS,
+        "score_tables", "col line image", _CELLS,
         f"out uchar pooled [{_size('scores')}]",
         "ScoreTable scores", "int reach",
     ),
     "fold_scores": kernel(
-        "search", "col line image", _CELLS,
+        "score_tables", "col line image", _CELLS,
         f"out uchar out [{_size('folded')}]",
         "ScoreTable scores", "ScoreTable folded", "int period", "int step", "int beyond", "int unit",
     ),
     "pack_quarters": kernel(
-        "search", "col line image", _CELLS, f"out {_QUARTERS}", "ScoreTable scores", "int reach",
+        "score_tables", "col line image", _CELLS, f"out {_QUARTERS}", "ScoreTable scores", "int reach",
     ),
     "fold_quarters": kernel(
-        "search", "col line image", _CELLS, f"uchar bound [{_size('bounds')}]", f"out int quarters [{_size('folded')}]",
-        "ScoreTable scores", "ScoreTable bounds", "ScoreTable folded", "int period", "int step", "int reach",
-        "int beyond", "int unit", "int across",
+        "score_tables", "col line image", _CELLS, f"uchar bound [{_size('bounds')}]",
+        f"out int quarters [{_size('folded')}]", "ScoreTable scores", "ScoreTable bounds", "ScoreTable folded",
+        "int period", "int step", "int reach", "int beyond", "int unit", "int across",
     ),
     "place_ends": kernel(
         "search_ends", "worker item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
@@ -98,7 +98,7 @@ KERNELS: dict[str, Kernel] = {
         "int size", "int bound_size", "int quarter_size",
     ),
     "pack_rows": kernel(
-        "search", "col line image", _CELLS, f"out int packed [{_size('scores')}]", "ScoreTable scores",
+        "score_tables", "col line image", _CELLS, f"out int packed [{_size('scores')}]", "ScoreTable scores",
     ),
     "shift_scores": kernel(
         "search", "col rows item", f"int table [{_size('scores')}]", *_ENDS, "uchar allowed [height * width]",
